@@ -1,0 +1,61 @@
+"""Entropy-regularised reinforcement learning in MDPs with stochastic dynamics, learnt from experience.
+
+Importing the package registers its Gymnasium environments. Its names load on first use, so that the
+import itself stays light.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+import erl_torch.envs  # noqa: F401  (registers the environments)
+
+if TYPE_CHECKING:
+    from erl_torch.checks import InputError
+    from erl_torch.evaluation import Evaluation, evaluate
+    from erl_torch.experience import collect
+    from erl_torch.learners.algorithm_s1 import AlgorithmS1, NonFiniteError, S1State
+    from erl_torch.mdp import TabularMDP
+    from erl_torch.solution import Solution, Status
+    from erl_torch.transitions import Transitions
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "AlgorithmS1": "learners.algorithm_s1",
+    "Evaluation": "evaluation",
+    "InputError": "checks",
+    "NonFiniteError": "learners.algorithm_s1",
+    "S1State": "learners.algorithm_s1",
+    "Solution": "solution",
+    "Status": "solution",
+    "TabularMDP": "mdp",
+    "Transitions": "transitions",
+    "collect": "experience",
+    "evaluate": "evaluation",
+}
+
+__all__ = [
+    "AlgorithmS1",
+    "Evaluation",
+    "InputError",
+    "NonFiniteError",
+    "S1State",
+    "Solution",
+    "Status",
+    "TabularMDP",
+    "Transitions",
+    "collect",
+    "evaluate",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'erl_torch' has no attribute '{name}'")
+    return getattr(importlib.import_module(f"erl_torch.{_HOME[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_HOME])

@@ -1,0 +1,62 @@
+"""TensorBoard: one event file a run. Tags, units and formulas: docs/logging.md."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from torch.utils.tensorboard import SummaryWriter
+from torch.utils.tensorboard.summary import hparams
+
+LAYOUT = {
+    "Convergence": {
+        "rho and theta": ["Multiline", ["s1/rho", "s1/theta"]],
+        "theta": ["Multiline", ["s1/theta"]],
+        "biasing": ["Multiline", ["s1/bias_iteration", "s1/psi_epochs"]],
+        "psi error": ["Multiline", ["s1/psi_error"]],
+    },
+    "Reward bias": {"delta": ["Multiline", ["s1/delta_max", "s1/delta_mean"]]},
+    "Returns": {
+        "reward per step and objective": ["Multiline", ["eval/reward_per_step", "eval/objective"]],
+        "episode return": ["Multiline", ["eval/return"]],
+    },
+}
+
+
+class Board:
+    """Writes records against tuples streamed. A context manager: what was logged survives an exception."""
+
+    def __init__(self, directory: str | os.PathLike[str], hyperparameters: Mapping[str, Any]) -> None:
+        self._writer = SummaryWriter(str(directory))
+        self._writer.add_custom_scalars(LAYOUT)
+        # Session start and end go into the run's own file: add_hparams would open a run directory more.
+        # No experiment summary: TensorBoard takes the first it finds and hides other runs' columns.
+        _, self._session_start, self._session_end = hparams(dict(hyperparameters), {})
+        self._summary(self._session_start)
+
+    def scalars(self, values: Mapping[str, float], step: int) -> None:
+        """One record; keys are full tags."""
+        for tag, value in values.items():
+            self._writer.add_scalar(tag, value, step)
+
+    def picture(self, tag: str, pixels: np.ndarray, step: int) -> None:
+        """An image [H, W, 3] uint8."""
+        self._writer.add_image(tag, pixels, step, dataformats="HWC")
+
+    def text(self, tag: str, markdown: str) -> None:
+        self._writer.add_text(tag, markdown)
+
+    def __enter__(self) -> Board:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._summary(self._session_end)
+        self._writer.close()
+
+    def _summary(self, summary: Any) -> None:
+        self._writer._get_file_writer().add_summary(summary)  # type: ignore[no-untyped-call]

@@ -1,0 +1,140 @@
+"""Typed schemas of the configuration in ``conf/``, and the resolvers that name run directories.
+
+Light to import (no torch): ``--help`` and Tab completion stop here. Types are checked by Hydra; unknown
+keys (``+learner.betta=2`` included) by ``check_keys``; ranges by what the values are handed to, first thing.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass, field, fields, is_dataclass
+from typing import Any
+
+from hydra.core.config_store import ConfigStore
+from omegaconf import MISSING, DictConfig, OmegaConf
+
+from erl_torch.checks import InputError
+
+
+@dataclass
+class WindyCliff:
+    name: str = "windy_cliff"
+    id: str = "erl_torch/WindyCliff-v0"
+    wind_angle: float = 0.75 * math.pi
+    wind_strength: float = 0.7
+    trap_reward: float = -5.0
+
+
+@dataclass
+class Gym:
+    name: str = MISSING
+    id: str = MISSING
+    kwargs: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass
+class S1:
+    """The arguments of ``erl_torch.AlgorithmS1``; prior_policy is a file here."""
+
+    name: str = "s1"
+    beta: float = 10.0
+    lr_u: float = 0.005
+    lr_rho: float | None = None
+    lr_psi: float = 0.1
+    n_epochs: int = 15
+    n_bias: int = 6
+    psi_tol: float = 1e-4
+    max_psi_epochs: int = 10_000
+    prior_policy: str | None = None
+    rho_init: str = "reset"
+    self_loop: str = "new"
+    clip_rho: bool = True
+    rescale_every: int | None = None
+    unvisited: str = "initial"
+    implementation: str = "fast"
+    device: str = "cpu"
+
+
+@dataclass
+class Simulate:
+    name: str = "simulate"
+    n_episodes: int = 500
+    episode_length: int = 1000
+    behaviour_policy: str | None = None
+    save_to: str | None = None
+
+
+@dataclass
+class Recorded:
+    name: str = "recorded"
+    path: str = MISSING
+
+
+@dataclass
+class Standard:
+    name: str = "standard"
+    every: int = 1
+    n_episodes: int = 20
+    horizon: int = 1000
+    pictures: bool = True
+
+
+@dataclass
+class Train:
+    seed: int = 0
+    threads: int = 1
+    env: Any = MISSING
+    learner: Any = MISSING
+    experience: Any = MISSING
+    evaluation: Any = MISSING
+
+
+SCHEMAS: dict[str, dict[str, type]] = {
+    "env": {"windy_cliff": WindyCliff, "gym": Gym},
+    "learner": {"s1": S1},
+    "experience": {"simulate": Simulate, "recorded": Recorded},
+    "evaluation": {"standard": Standard},
+}
+
+
+def slug(text: Any) -> str:
+    """``text`` as part of a file name: no separators, nothing a shell would touch."""
+    return re.sub(r"[^A-Za-z0-9_.=+-]+", "-", str(text)).strip("-.") or "run"
+
+
+def run_name(number: int, overrides: str) -> str:
+    """``NNN-key=value-...`` of a multirun job: keys without their group, at most 80 characters."""
+    parts = [part.lstrip("+~").split(".")[-1] if "=" not in part else
+             part.split("=", 1)[0].lstrip("+~").split(".")[-1] + "=" + part.split("=", 1)[1]
+             for part in overrides.split(",") if part]  # fmt: skip
+    return f"{int(number):03d}-{slug('-'.join(parts))}"[:80]
+
+
+def register() -> None:
+    """Make the schemas and resolvers known to Hydra; harmless when repeated."""
+    store = ConfigStore.instance()
+    for group, options in SCHEMAS.items():
+        for name, schema in options.items():
+            store.store(group=f"schema/{group}", name=name, node=schema)
+    store.store(group="schema", name="train", node=Train)
+    OmegaConf.register_new_resolver("slug", slug, replace=True)
+    OmegaConf.register_new_resolver("run_name", run_name, replace=True)
+
+
+def check_keys(cfg: DictConfig) -> None:
+    """Raise InputError for a key that no schema has, and for one that has no value."""
+    _check_node(cfg, Train, "")
+    for group in SCHEMAS:
+        _check_node(cfg[group], OmegaConf.get_type(cfg[group]), f"{group}.")
+
+
+def _check_node(node: DictConfig, schema: Any, prefix: str) -> None:
+    known = [f.name for f in fields(schema)] if is_dataclass(schema) else []
+    for key in node:
+        if key not in known:
+            value = OmegaConf.to_container(node, throw_on_missing=False)[key]  # type: ignore[call-overload,index]
+            raise InputError(f"{prefix}{key}", value, f"left out: no such key; there are {', '.join(known)}")
+    for key in known:
+        if OmegaConf.is_missing(node, key):
+            raise InputError(f"{prefix}{key}", "???", f"given, as in {prefix}{key}=VALUE")

@@ -1,0 +1,162 @@
+"""What a policy is worth: returns, reward rate and the regularised objective.
+
+``objective`` is J(pi) = reward rate - KL rate / beta, with KL(pi(.|s) || prior(.|s)) averaged over the
+states the policy visits; its maximum over policies is -theta*.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+import scipy.sparse as sp
+import scipy.sparse.csgraph as csgraph
+import scipy.sparse.linalg as spla
+
+from erl_torch import kernels
+from erl_torch.experience import known_mdp, policy_cdf, reset, sampling_tables, sizes
+from erl_torch.mdp import TabularMDP, check_policy
+
+
+class Evaluation(NamedTuple):
+    """Figures of one policy in one environment."""
+
+    mean_return: float  # undiscounted return of an episode, mean over sampled episodes
+    reward_per_step: float  # exact over the horizon where the model is known, else sampled
+    objective: float  # reward rate - KL/beta; exact (stationary) where the model is known, else sampled
+
+
+class PolicyChain(NamedTuple):
+    """The Markov chain that a policy makes of an MDP."""
+
+    transition: sp.csr_array  # [S, S]
+    reward: np.ndarray  # [S]
+
+
+def policy_chain(mdp: TabularMDP, policy: np.ndarray) -> PolicyChain:
+    """The chain of ``policy`` [S, A]."""
+    n_states, n_actions = policy.shape
+    n = n_states * n_actions
+    choose = sp.csr_array(
+        (policy.ravel(), np.arange(n), np.arange(0, n + 1, n_actions)), shape=(n_states, n)
+    )
+    return PolicyChain(sp.csr_array(choose @ mdp.transition), (policy * mdp.reward).sum(1))
+
+
+def kl_per_state(policy: np.ndarray, prior: np.ndarray) -> np.ndarray:
+    """KL(policy(.|s) || prior(.|s)) in nats, [S]; infinite where the policy leaves the prior's support."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        terms = np.where(policy > 0, policy * np.log(policy / prior), 0.0)
+    return terms.sum(1)  # type: ignore[no-any-return]
+
+
+def reward_per_step(mdp: TabularMDP, policy: np.ndarray, horizon: int) -> float:
+    """Expected undiscounted return of ``horizon`` steps from the start distribution, divided by ``horizon``."""
+    chain = policy_chain(mdp, policy)
+    p = chain.transition
+    total = kernels.finite_horizon_return(p.indptr, p.indices, p.data, chain.reward, mdp.start, horizon)
+    return float(total) / horizon
+
+
+def stationary_distribution(transition: sp.csr_array, start: np.ndarray) -> np.ndarray:
+    """Long-run share of time in each state, from ``start`` [S]; chain as CSR [S, S].
+
+    Periodic chains and chains with several closed classes are fine: each class counts by the probability
+    of ending in it.
+    """
+    n = len(start)
+    chain = sp.csr_array(transition)
+    chain.eliminate_zeros()
+    _, label = csgraph.connected_components(chain, directed=True, connection="strong")
+    origin, target = np.repeat(np.arange(n), np.diff(chain.indptr)), chain.indices
+    leaves = np.zeros(label.max() + 1, bool)
+    leaves[label[origin[label[origin] != label[target]]]] = True
+    transient = leaves[label]
+    # Expected visits to transient states, hence the flow into each closed class.
+    inflow = start.copy()
+    if transient.any():
+        among = chain[transient][:, transient]
+        visits = spla.spsolve(sp.csc_array(sp.eye_array(int(transient.sum())) - among.T), start[transient])
+        inflow = inflow + chain[transient].T @ np.atleast_1d(visits)
+    share = np.zeros(n)
+    for component in np.unique(label[~transient]):
+        inside = label == component
+        mass = inflow[inside].sum()
+        if mass > 0:
+            share[inside] = mass * _stationary_irreducible(chain[inside][:, inside])
+    return share
+
+
+def _stationary_irreducible(chain: sp.csr_array) -> np.ndarray:
+    n = chain.shape[0]
+    if n == 1:
+        return np.ones(1)
+    # d (I - P) = 0 with d[0] = 1: the rest is a nonsingular system.
+    system = sp.csc_array((sp.eye_array(n) - chain).T)
+    d = np.concatenate([[1.0], np.atleast_1d(spla.spsolve(system[1:, 1:], -system[1:, [0]].toarray().ravel()))])
+    d = np.maximum(d, 0.0)
+    return d / d.sum()  # type: ignore[no-any-return]
+
+
+def objective(mdp: TabularMDP, policy: np.ndarray, prior: np.ndarray, beta: float) -> float:
+    """J(pi): stationary reward rate minus KL/beta, from the start distribution; reward a step."""
+    chain = policy_chain(mdp, policy)
+    d = stationary_distribution(chain.transition, mdp.start)
+    used = d > 0
+    return float(d[used] @ (chain.reward - kl_per_state(policy, prior) / beta)[used])
+
+
+def evaluate(
+    source: TabularMDP | gym.Env[Any, Any],
+    policy: Any,
+    beta: float,
+    rng: np.random.Generator,
+    n_episodes: int = 20,
+    horizon: int = 1000,
+    prior_policy: Any = None,
+) -> Evaluation:
+    """Evaluate ``policy`` [S, A]: exactly where the model is known, by ``env.step`` otherwise.
+
+    Sampled episodes end after ``horizon`` steps, or where the environment ends them.
+    """
+    n_states, n_actions = sizes(source)
+    table = check_policy("policy", policy, n_states, n_actions)
+    prior = check_policy("prior_policy", prior_policy, n_states, n_actions)
+    mdp = known_mdp(source)
+    if mdp is None:
+        return _evaluate_by_stepping(source, table, prior, beta, rng, n_episodes, horizon)  # type: ignore[arg-type]
+    returns = np.empty(n_episodes)
+    kernels.simulate_returns(*sampling_tables(mdp), policy_cdf(table), horizon, rng, returns)
+    return Evaluation(
+        mean_return=float(returns.mean()),
+        reward_per_step=reward_per_step(mdp, table, horizon),
+        objective=objective(mdp, table, prior, beta),
+    )
+
+
+def _evaluate_by_stepping(
+    env: gym.Env[Any, Any],
+    policy: np.ndarray,
+    prior: np.ndarray,
+    beta: float,
+    rng: np.random.Generator,
+    n_episodes: int,
+    horizon: int,
+) -> Evaluation:
+    kl = kl_per_state(policy, prior)
+    cdf = np.cumsum(policy, axis=1)
+    total = total_kl = 0.0
+    n_steps = 0
+    for _ in range(n_episodes):
+        s = reset(env, rng)
+        for _ in range(horizon):
+            a = int(np.searchsorted(cdf[s], rng.random() * cdf[s, -1], side="right"))
+            observation, reward, terminated, truncated, _ = env.step(a)
+            total += float(reward)
+            total_kl += kl[s]
+            n_steps += 1
+            s = int(observation)
+            if terminated or truncated:
+                break
+    return Evaluation(total / n_episodes, total / n_steps, float(total - total_kl / beta) / n_steps)

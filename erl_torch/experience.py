@@ -1,0 +1,174 @@
+"""Collecting a stream of tuples under a behaviour policy.
+
+A TabularMDP, or an environment that carries one as ``env.unwrapped.mdp``, is sampled in a compiled loop;
+any other Gymnasium environment with Discrete spaces through ``env.step``.
+
+a' is always a draw from the prior at s'. When the behaviour policy is the prior, a' is also the action
+taken next (the paper's stream); otherwise it is a draw of its own.
+
+Ends of episodes. The eigenvalue problem is that of an endless process, so where an environment
+*terminates*, s' is the first state of the next episode: the terminal state leads straight to the start.
+Where an episode is only *truncated* (a time limit, or ``episode_length``), s' is the state reached, and the
+next tuple begins at a fresh start.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from erl_torch import checks, kernels
+from erl_torch.checks import InputError
+from erl_torch.mdp import TabularMDP, check_policy
+from erl_torch.rng import Streams, streams
+from erl_torch.transitions import Transitions
+
+BLOCK = 1_000_000  # steps a compiled call, so that signals and progress bars are served
+
+Report = Callable[[int], object]
+
+
+def known_mdp(source: TabularMDP | gym.Env[Any, Any]) -> TabularMDP | None:
+    """The model behind ``source``, where there is one: the MDP itself, or ``env.unwrapped.mdp``."""
+    if isinstance(source, TabularMDP):
+        return source
+    mdp = getattr(source.unwrapped, "mdp", None)
+    return mdp if isinstance(mdp, TabularMDP) else None
+
+
+def sizes(source: TabularMDP | gym.Env[Any, Any]) -> tuple[int, int]:
+    """(n_states, n_actions). Raises InputError unless both spaces are Discrete and start at 0."""
+    if isinstance(source, TabularMDP):
+        return source.n_states, source.n_actions
+    for name in ("observation_space", "action_space"):
+        space = getattr(source, name)
+        if not isinstance(space, gym.spaces.Discrete) or space.start != 0:
+            raise InputError(name, space, "Discrete, starting at 0 (discretise the environment first)")
+    return int(source.observation_space.n), int(source.action_space.n)  # type: ignore[attr-defined]
+
+
+def collect(
+    source: TabularMDP | gym.Env[Any, Any],
+    n_episodes: int,
+    episode_length: int,
+    seed: int | Streams = 0,
+    behaviour_policy: Any = None,
+    prior_policy: Any = None,
+    report: Report | None = None,
+) -> Transitions:
+    """Collect experience.
+
+    Args:
+        source: a TabularMDP or a Gymnasium environment with Discrete spaces.
+        n_episodes, episode_length: whole numbers >= 1. A TabularMDP gives exactly their product in tuples;
+            an environment's own ends make episodes shorter.
+        seed: a whole number, or the streams of one.
+        behaviour_policy: [S, A]; None is the prior.
+        prior_policy: [S, A], behind a'; None is uniform.
+        report: called with the number of tuples after each block.
+
+    Raises:
+        InputError: an argument out of range, or spaces that are not Discrete.
+    """
+    checks.at_least("n_episodes", n_episodes, 1)
+    checks.at_least("episode_length", episode_length, 1)
+    n_states, n_actions = sizes(source)
+    prior = check_policy("prior_policy", prior_policy, n_states, n_actions)
+    on_prior = behaviour_policy is None
+    behaviour = prior if on_prior else check_policy("behaviour_policy", behaviour_policy, n_states, n_actions)
+    rng = seed if isinstance(seed, Streams) else streams(seed)
+    report = report or (lambda _: None)
+    mdp = known_mdp(source)
+    if mdp is not None:
+        return _simulate(mdp, n_episodes, episode_length, rng, behaviour, prior, on_prior, report)
+    return _step_through(source, n_episodes, episode_length, rng, behaviour, prior, on_prior, report)
+
+
+def _simulate(
+    mdp: TabularMDP,
+    n_episodes: int,
+    episode_length: int,
+    rng: Streams,
+    behaviour: np.ndarray,
+    prior: np.ndarray,
+    on_prior: bool,
+    report: Report,
+) -> Transitions:
+    n = n_episodes * episode_length
+    integers = [np.empty(n, np.int32) for _ in range(4)]
+    s, a, s_next, a_next = integers
+    r = np.empty(n)
+    tables = (
+        *sampling_tables(mdp),
+        policy_cdf(behaviour),
+        policy_cdf(prior),
+        on_prior,
+        episode_length,
+        rng.environment,
+        rng.behaviour,
+    )
+    # Whole episodes a block: the kernel starts each block with a fresh one.
+    block = max(1, BLOCK // episode_length) * episode_length
+    for begin in range(0, n, block):
+        part = slice(begin, min(n, begin + block))
+        kernels.simulate(*tables, s[part], a[part], r[part], s_next[part], a_next[part])
+        report(part.stop)
+    return Transitions(s, a, r, s_next, a_next)
+
+
+def sampling_tables(mdp: TabularMDP) -> tuple[np.ndarray, ...]:
+    """(indptr, indices, cdf, reward, start cdf) as the sampling kernels take them."""
+    p = mdp.transition
+    start_cdf = kernels.cumulative_rows(np.array([0, mdp.n_states]), mdp.start)
+    return p.indptr, p.indices, kernels.cumulative_rows(p.indptr, p.data), mdp.reward, start_cdf
+
+
+def policy_cdf(policy: np.ndarray) -> np.ndarray:
+    """Running sums of each row, flat [S*A]."""
+    n_states, n_actions = policy.shape
+    return kernels.cumulative_rows(np.arange(0, n_states * n_actions + 1, n_actions), policy.ravel())
+
+
+def _step_through(
+    env: gym.Env[Any, Any],
+    n_episodes: int,
+    episode_length: int,
+    rng: Streams,
+    behaviour: np.ndarray,
+    prior: np.ndarray,
+    on_prior: bool,
+    report: Report,
+) -> Transitions:
+    rows: list[tuple[int, int, float, int, int]] = []
+    behaviour_cdf, prior_cdf = np.cumsum(behaviour, axis=1), np.cumsum(prior, axis=1)
+
+    def draw(cdf: np.ndarray, s: int) -> int:
+        x = rng.behaviour.random() * cdf[s, -1]
+        return int(np.searchsorted(cdf[s], x, side="right"))
+
+    state = reset(env, rng.environment)
+    for _ in range(n_episodes):
+        action = draw(behaviour_cdf, state)
+        for step in range(1, episode_length + 1):
+            observation, reward, terminated, truncated, _ = env.step(action)
+            over = terminated or truncated or step == episode_length
+            fresh = reset(env, rng.environment) if over else None
+            state_next = fresh if terminated and fresh is not None else int(observation)
+            action_next = draw(prior_cdf, state_next)
+            rows.append((state, action, float(reward), state_next, action_next))
+            if len(rows) % 10_000 == 0:
+                report(len(rows))
+            state = state_next if fresh is None else fresh
+            if over:
+                break
+            action = action_next if on_prior else draw(behaviour_cdf, state)
+    report(len(rows))
+    return Transitions(*(np.array(column) for column in zip(*rows, strict=True)))
+
+
+def reset(env: gym.Env[Any, Any], rng: np.random.Generator) -> int:
+    """Reset ``env`` with a seed drawn from ``rng``; the first state."""
+    return int(env.reset(seed=int(rng.integers(2**31)))[0])

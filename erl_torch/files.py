@@ -1,0 +1,82 @@
+"""Files are written to a temporary name and renamed, and read without pickle."""
+
+from __future__ import annotations
+
+import json
+import os
+import zipfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from erl_torch.checks import InputError
+
+
+def _write(path: str | os.PathLike[str], fill: Callable[[BinaryIO], None]) -> Path:
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with open(temporary, "wb") as file:
+            fill(file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return path
+
+
+def write_npz(path: str | os.PathLike[str], arrays: Mapping[str, Any]) -> Path:
+    """Write a compressed npz; the same arrays give the same bytes. Object arrays are refused."""
+
+    def fill(file: BinaryIO) -> None:
+        with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=3) as archive:
+            for name, value in arrays.items():
+                # A fixed date: equal results are then equal files.
+                member = zipfile.ZipInfo(f"{name}.npy", date_time=(1980, 1, 1, 0, 0, 0))
+                member.compress_type = zipfile.ZIP_DEFLATED
+                with archive.open(member, "w", force_zip64=True) as entry:
+                    np.lib.format.write_array(entry, np.asarray(value), allow_pickle=False)
+
+    return _write(path, fill)
+
+
+def write_json(path: str | os.PathLike[str], value: Mapping[str, Any]) -> Path:
+    """Write JSON (no NaN or infinity)."""
+    text = json.dumps(value, indent=2, allow_nan=False) + "\n"
+
+    def fill(file: BinaryIO) -> None:
+        file.write(text.encode())
+
+    return _write(path, fill)
+
+
+def read_npz(path: str | os.PathLike[str], key: str = "path") -> dict[str, np.ndarray]:
+    """All arrays of an npz file, without pickle.
+
+    Raises InputError (under ``key``) if the file is missing, damaged, or holds objects.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            if not isinstance(archive, np.lib.npyio.NpzFile):
+                raise InputError(key, path, "an npz file")
+            return {name: archive[name] for name in archive.files}
+    except InputError:
+        raise
+    except Exception as error:
+        # np.load answers damage with a dozen kinds of exception, zlib's and struct's among them.
+        raise InputError(key, path, f"a readable npz file without pickled objects ({error})") from error
+
+
+def read_npy(path: str | os.PathLike[str], key: str = "path") -> np.ndarray:
+    """One array from an npy file, without pickle. Raises InputError under ``key``."""
+    try:
+        array = np.load(path, allow_pickle=False)
+    except Exception as error:
+        raise InputError(key, path, f"a readable npy file without pickled objects ({error})") from error
+    if not isinstance(array, np.ndarray):
+        raise InputError(key, path, "an npy file")
+    return array

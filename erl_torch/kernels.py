@@ -1,0 +1,304 @@
+"""Every compiled loop of the package.
+
+Kernels take plain C-contiguous arrays and scalars, use no globals, and validate nothing: the callers do.
+They stand in one file because Numba's cache does not notice a changed kernel in another file.
+
+Pair index: ``k = s * n_actions + a``. Transition matrices come as CSR arrays (indptr, indices, data).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+# ---------------------------------------------------------------------------------------------------
+# Algorithm S1, lines 2-3: one epoch of the psi phase is the affine map x <- decay * x + W psi
+# ---------------------------------------------------------------------------------------------------
+
+
+@numba.njit(cache=True)
+def visit_counts(pair, n_pairs):
+    """Visits of every pair. pair [N] int32 -> [n_pairs] int64."""
+    counts = np.zeros(n_pairs, np.int64)
+    for t in range(pair.size):
+        counts[pair[t]] += 1
+    return counts
+
+
+@numba.njit(cache=True)
+def psi_map(pair, s_next, counts, n_states, lr_psi):
+    """W of one psi epoch as CSR [n_pairs, n_states]; the decay is (1 - lr_psi)**counts.
+
+    The i-th visit from the end of a pair enters with weight lr_psi * (1 - lr_psi)**i.
+    """
+    n_pairs = counts.size
+    # A stable counting sort brings the visits of a pair together, in order: one pass over the stream.
+    end = np.cumsum(counts)
+    fill = end - counts
+    visits = np.empty(pair.size, np.int32)
+    for t in range(pair.size):
+        k = pair[t]
+        visits[fill[k]] = s_next[t]
+        fill[k] += 1
+
+    indptr = np.zeros(n_pairs + 1, np.int64)
+    indices = np.empty(max(1, min(pair.size, n_pairs * n_states)), np.int32)
+    data = np.empty(indices.size, np.float64)
+    weight_of = np.zeros(n_states, np.float64)
+    n = 0
+    for k in range(n_pairs):
+        weight = lr_psi
+        first = n
+        for v in range(end[k] - 1, end[k] - counts[k] - 1, -1):
+            if weight < 1e-300:  # older visits are below the last bit of the sum
+                break
+            s = visits[v]
+            if weight_of[s] == 0.0:
+                indices[n] = s
+                n += 1
+            weight_of[s] += weight
+            weight *= 1.0 - lr_psi
+        indices[first:n].sort()
+        for m in range(first, n):
+            data[m] = weight_of[indices[m]]
+            weight_of[indices[m]] = 0.0
+        indptr[k + 1] = n
+    return indptr, indices[:n].copy(), data[:n].copy()
+
+
+@numba.njit(cache=True)
+def psi_phase(
+    indptr, indices, data, decay, psi, log_psi, mean_psi, mean_log_psi, tolerance, epsilon, max_epochs
+):
+    """Lines 2-3 until the relative change between epochs is below ``tolerance``; tables change in place.
+
+    Each epoch costs O(n_pairs), whatever the number of tuples. Returns (epochs, last relative change).
+    """
+    n_pairs = decay.size
+    add_psi = np.zeros(n_pairs)
+    add_log_psi = np.zeros(n_pairs)
+    for k in range(n_pairs):
+        for m in range(indptr[k], indptr[k + 1]):
+            add_psi[k] += data[m] * psi[indices[m]]
+            add_log_psi[k] += data[m] * log_psi[indices[m]]
+    change = np.inf
+    epochs = 0
+    while epochs < max_epochs:
+        epochs += 1
+        change = 0.0
+        for k in range(n_pairs):
+            x = mean_psi[k]
+            mean_psi[k] = decay[k] * x + add_psi[k]
+            change = max(change, abs(mean_psi[k] - x) / x)
+            y = mean_log_psi[k]
+            mean_log_psi[k] = decay[k] * y + add_log_psi[k]
+            change = max(change, abs(mean_log_psi[k] - y) / (abs(y) + epsilon))
+        if not change >= tolerance:  # also leaves on NaN
+            break
+    return epochs, change
+
+
+# ---------------------------------------------------------------------------------------------------
+# Algorithm S1, lines 9-11, in the gauge z = psi * u, with one division a tuple
+# ---------------------------------------------------------------------------------------------------
+
+
+@numba.njit(cache=True, fastmath={"contract"})
+def _u_chunk(pair, pair_next, factor, noisy, g, z, inv_rho, lr_u, lr_rho, inv_rho_min, new, begin, end):
+    """Tuples begin..end of lines 9-11. z changes in place; returns 1/rho.
+
+    With q = 1/rho and w = g * z(s',a'), line 10 is z' = (1-lr_u) z + lr_u w q, and line 11,
+    rho' = (1-lr_rho) rho + lr_rho w / z', becomes q' = q z' / ((1-lr_rho) z' + lr_rho w q). Written in
+    the old z, numerator and denominator are ready while the division runs.
+    """
+    keep = 1.0 - lr_u
+    keep_rho = 1.0 - lr_rho
+    both = keep_rho * lr_u + lr_rho
+    q = inv_rho
+    for t in range(begin, end):
+        k = pair[t]
+        j = pair_next[t]
+        gain = g[k]
+        if noisy:
+            gain *= factor[t]
+        w = gain * z[j]
+        kept = keep * z[k]
+        z_new = kept + (lr_u * w) * q
+        z[k] = z_new
+        # Self-loop read with the new u: u(s',a')/u(s,a) = 1 in line 11. Selects, not branches.
+        same = new and k == j
+        den_kept = keep_rho if same else keep_rho * kept
+        den_w = lr_rho * gain if same else both * w
+        num = 1.0 if same else z_new
+        q = (q / (den_kept + den_w * q)) * num
+        if q < inv_rho_min:  # not max(): NaN must stay visible
+            q = inv_rho_min
+    return q
+
+
+@numba.njit(cache=True)
+def _is_healthy(z, q):
+    if not (np.isfinite(q) and q > 0.0):
+        return False
+    for k in range(z.size):
+        if not (np.isfinite(z[k]) and z[k] > 0.0):
+            return False
+    return True
+
+
+@numba.njit(cache=True)
+def u_epoch(
+    pair, pair_next, factor, noisy, g, z, inv_rho, lr_u, lr_rho, inv_rho_min, new, rescale_every, begin, end
+):
+    """Lines 9-11 over tuples begin..end; z [n_pairs] changes in place.
+
+    Every ``rescale_every`` tuples z is multiplied by a power of two that brings its mean to about 1: the
+    updates are homogeneous in z, so this changes no bit of rho or of the policy.
+
+    Returns (1/rho, t): t = end, or the first tuple whose update is not a positive finite number.
+    """
+    backup = np.empty_like(z)
+    q = inv_rho
+    t = begin
+    while t < end:
+        stop = min(end, t - t % rescale_every + rescale_every)
+        backup[:] = z
+        q_before = q
+        q = _u_chunk(
+            pair, pair_next, factor, noisy, g, z, q, lr_u, lr_rho, inv_rho_min, new, t, stop
+        )
+        if not _is_healthy(z, q):
+            z[:] = backup
+            q = q_before
+            for bad in range(t, stop):
+                q = _u_chunk(
+                    pair, pair_next, factor, noisy, g, z, q, lr_u, lr_rho, inv_rho_min, new, bad, bad + 1
+                )
+                k = pair[bad]
+                if not (np.isfinite(q) and q > 0.0 and np.isfinite(z[k]) and z[k] > 0.0):
+                    return q, bad
+            return q, stop - 1
+        t = stop
+        if t % rescale_every == 0:
+            _, exponent = math.frexp(np.mean(z))
+            if exponent > 1 or exponent < 0:
+                scale = math.ldexp(1.0, -exponent)
+                for k in range(z.size):
+                    z[k] *= scale
+    return q, end
+
+
+# ---------------------------------------------------------------------------------------------------
+# Sampling a finite MDP, and exact finite-horizon returns
+# ---------------------------------------------------------------------------------------------------
+
+
+@numba.njit(cache=True)
+def cumulative_rows(indptr, data):
+    """Running sums within each CSR row; 1 from the last positive entry on, so that rounding can neither
+    leave the row nor reach an entry of probability 0."""
+    cdf = np.empty_like(data)
+    for row in range(indptr.size - 1):
+        total = 0.0
+        last = indptr[row]
+        for m in range(indptr[row], indptr[row + 1]):
+            total += data[m]
+            cdf[m] = total
+            if data[m] > 0.0:
+                last = m
+        cdf[last : indptr[row + 1]] = 1.0
+    return cdf
+
+
+@numba.njit(cache=True)
+def _draw(cdf, low, high, x):
+    """First index m in [low, high) with x < cdf[m], by bisection."""
+    high -= 1
+    while low < high:
+        middle = (low + high) // 2
+        if x < cdf[middle]:
+            high = middle
+        else:
+            low = middle + 1
+    return low
+
+
+@numba.njit(cache=True)
+def simulate(
+    indptr,
+    indices,
+    cdf,
+    reward,
+    start_cdf,
+    behaviour_cdf,
+    prior_cdf,
+    on_prior,
+    episode_length,
+    environment_rng,
+    behaviour_rng,
+    s_out,
+    a_out,
+    r_out,
+    s_next_out,
+    a_next_out,
+):
+    """Episodes of ``episode_length`` steps, written into the five columns (their length is the total).
+
+    ``reward`` [S, A]; the cdfs of the policies are flat [S*A]. With ``on_prior`` the behaviour policy is
+    the prior and the action taken next is a'; otherwise a' is a draw of its own.
+    """
+    n_actions = reward.shape[1]
+    s = 0
+    a = 0
+    for t in range(s_out.size):
+        if t % episode_length == 0:
+            s = _draw(start_cdf, 0, start_cdf.size, environment_rng.random())
+            a = _draw(behaviour_cdf, s * n_actions, (s + 1) * n_actions, behaviour_rng.random())
+            a -= s * n_actions
+        k = s * n_actions + a
+        s_next = indices[_draw(cdf, indptr[k], indptr[k + 1], environment_rng.random())]
+        first = s_next * n_actions
+        a_next = _draw(prior_cdf, first, first + n_actions, behaviour_rng.random()) - first
+        s_out[t] = s
+        a_out[t] = a
+        r_out[t] = reward[s, a]
+        s_next_out[t] = s_next
+        a_next_out[t] = a_next
+        s = s_next
+        if on_prior:
+            a = a_next
+        else:
+            a = _draw(behaviour_cdf, first, first + n_actions, behaviour_rng.random()) - first
+
+
+@numba.njit(cache=True)
+def simulate_returns(indptr, indices, cdf, reward, start_cdf, policy_cdf, episode_length, rng, returns):
+    """Undiscounted return of ``returns.size`` episodes under a policy (cdf flat [S*A]); fills ``returns``."""
+    n_actions = reward.shape[1]
+    for episode in range(returns.size):
+        s = _draw(start_cdf, 0, start_cdf.size, rng.random())
+        total = 0.0
+        for _ in range(episode_length):
+            k = _draw(policy_cdf, s * n_actions, (s + 1) * n_actions, rng.random())
+            total += reward[s, k - s * n_actions]
+            s = indices[_draw(cdf, indptr[k], indptr[k + 1], rng.random())]
+        returns[episode] = total
+
+
+@numba.njit(cache=True)
+def finite_horizon_return(indptr, indices, data, reward, start, horizon):
+    """Expected undiscounted sum of ``reward`` [S] over ``horizon`` steps of the chain (CSR [S, S]) from ``start``."""
+    now = start.copy()
+    after = np.empty_like(now)
+    total = 0.0
+    for _ in range(horizon):
+        after[:] = 0.0
+        for s in range(now.size):
+            if now[s] != 0.0:
+                total += now[s] * reward[s]
+                for m in range(indptr[s], indptr[s + 1]):
+                    after[indices[m]] += now[s] * data[m]
+        now, after = after, now
+    return total

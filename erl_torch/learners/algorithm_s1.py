@@ -1,0 +1,504 @@
+r"""Algorithm S1: the optimal entropy-regularised policy of a stochastic MDP, from experience alone.
+
+Source: Arriojas, Adamczyk, Tiomkin, Kulkarni, "Bayesian inference approach for entropy regularized
+reinforcement learning with stochastic dynamics", UAI 2023, supplement B. Equation and line numbers are the
+supplement's.
+
+Symbols (S states, A actions; every expectation <.> is over s' ~ p(.|s,a))
+
+    beta               inverse temperature, 1/reward
+    prior_policy       pi0(a|s), [S, A]
+    u                  left eigenvector of the tilted matrix, [S, A] > 0, up to scale           eq. (3)
+    rho                its dominant eigenvalue                                                  eq. (3)
+    psi                1 / sum_a pi0(a|s) u(s,a), [S]                                           eq. (7)
+    mean_psi           <psi>(s,a), [S, A]                                                       eq. (10)
+    mean_log_psi       <log psi>(s,a), [S, A]                                                   eq. (11)
+    b                  dynamics bias psi(s') / <psi>(s,a)                                       eq. (8)
+    reward_bias        delta(s,a) = (log <psi> - <log psi>) / beta >= 0, reward                 eq. (9)
+    reward_bias_max    Delta = max delta, reward
+    theta              -log(rho)/beta - Delta, reward a step; -theta is the reward rate minus KL/beta
+
+One biasing iteration estimates <psi> and <log psi> from the stream (lines 2-3, the psi phase), then streams
+
+    u(s,a) += lr_u * (exp(beta r_b) b(s'|s,a) u(s',a') / rho - u(s,a))          lines 9, 10; eq. (5)
+    rho    += lr_rho * (exp(beta r_b) b(s'|s,a) u(s',a') / u(s,a) - rho)        line 11;     eq. (6)
+
+with r_b = r + delta - Delta for n_epochs passes (the u phase), and sets psi anew (line 12). The policy is
+pi0 u, normalised (lines 13-14). The first iteration has psi = 1, no bias: its policy is the optimistic one.
+
+Exact rearrangements used by ``implementation="fast"`` (the literal twin is ``erl_torch.learners.listing``)
+
+    psi phase   psi is fixed during lines 2-3, so an epoch is the affine map x <- d x + W psi with
+                d = (1-lr_psi)**n(s,a) and W found once a stream: further epochs cost O(S A), not O(N).
+    gauge       exp(beta delta) b = psi(s') exp(-<log psi>), so with z = psi u one table
+                g = exp(beta (r - Delta) - <log psi> + log psi(s)) holds all of lines 9-11.
+    division    with q = 1/rho line 11 is q <- q z' / ((1-lr_rho) z' + lr_rho g z(s',a') q): one division.
+
+What the listing leaves open, and what is done here
+    1. lr_rho has no value in the listing: None is lr_u / n_states, as in the authors' script.
+    2. Rescaling u is not in the listing: neutral, since the updates are homogeneous in u. Every
+       ``rescale_every`` tuples (fast: by powers of two, so no bit of rho or of the policy changes), and to
+       mean 1 after each epoch.
+    3. ``clip_rho``: rho <= max(1, exp(beta max r)) after each update. The script clips at 1, which holds
+       for r <= 0 only; the wider bound holds for any reward, because sum_s' p b = 1 and delta <= Delta.
+    4. ``rho_init``: "reset" sets rho = exp(-beta) in every biasing iteration (line 8), "carry" only once
+       (the script).
+    5. <psi> and <log psi> are carried over between biasing iterations (line 1 stands before the loop).
+    6. "Relative error" is the largest of |d<psi>|/<psi> and |d<log psi>|/(|<log psi>| + 1e-10) over all
+       pairs, from one epoch to the next.
+    7. ``self_loop``: where (s',a') = (s,a), line 11 sees the u that line 10 has just written ("new", the
+       listing read in order), or the one before ("old", the script).
+    8. n_bias counts all iterations, the unbiased first included: the script's n_bias_iter = 5 is 6 here.
+    9. ``unvisited``: a pair that never occurs keeps u = 1 of line 7, scaled along with the rest
+       ("initial": the listing, the script), or has the value that gives it exactly its prior probability
+       ("prior"). A state that never occurs keeps the prior policy either way.
+   10. Rewards that vary for the same (s,a) are used as they come: S1 averages exp(beta r), and is
+       optimistic about that noise.
+   11. Delta is the maximum over the pairs that occur.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from erl_torch import checks, kernels
+from erl_torch.checks import InputError
+from erl_torch.learners import listing
+from erl_torch.mdp import check_policy
+from erl_torch.solution import Solution, Status
+from erl_torch.transitions import Transitions
+
+LOG_PSI_EPSILON = 1e-10  # keeps the relative error of <log psi> finite where it is 0
+BLOCK = 1 << 24  # tuples a compiled call, so that signals are served several times a second
+
+
+class NonFiniteError(ArithmeticError):
+    """A table left the positive finite numbers. ``step`` counts u updates; ``cause`` names tuple and values."""
+
+    def __init__(self, step: int, cause: str) -> None:
+        super().__init__(step, cause)
+        self.step, self.cause = step, cause
+
+    def __str__(self) -> str:
+        return f"step {self.step}: {self.cause}"
+
+
+@dataclass(frozen=True, eq=False)
+class S1State:
+    """Everything Algorithm S1 knows after an epoch of its u phase; a value, never changed in place."""
+
+    bias_iteration: int  # 0 is the unbiased iteration
+    epoch: int  # epochs of the u phase done in this biasing iteration
+    n_tuples: int  # tuples streamed through lines 9-11 since the start
+    beta: float
+    rho: float
+    prior_policy: torch.Tensor  # [S, A]
+    u: torch.Tensor  # [S, A], mean 1
+    psi: torch.Tensor  # [S], line 12 of this u
+    psi_in_use: torch.Tensor  # [S], behind the present biases
+    mean_psi: torch.Tensor  # [S, A]
+    mean_log_psi: torch.Tensor  # [S, A]
+    reward_bias: torch.Tensor  # [S, A], line 5; 0 where the stream has no visit
+    psi_error: float  # relative error at which the psi phase stopped
+    psi_epochs: int  # epochs it took
+    psi_converged: bool = True  # false once a psi phase has met max_psi_epochs
+
+    @property
+    def reward_bias_max(self) -> float:
+        """Delta, line 6; reward."""
+        return float(self.reward_bias.max())
+
+    @property
+    def theta(self) -> float:
+        """-log(rho)/beta - Delta, reward a step."""
+        return -math.log(self.rho) / self.beta - self.reward_bias_max
+
+    @property
+    def policy(self) -> torch.Tensor:
+        """[S, A], lines 13-14."""
+        weight = self.prior_policy * self.u
+        return weight / weight.sum(1, keepdim=True)
+
+    def metrics(self) -> dict[str, float]:
+        """The scalars that are logged, by their documented names (docs/logging.md)."""
+        return {
+            "rho": self.rho,
+            "theta": self.theta,
+            "delta_max": self.reward_bias_max,
+            "delta_mean": float(self.reward_bias.mean()),
+            "psi_error": self.psi_error,
+            "psi_epochs": self.psi_epochs,
+            "bias_iteration": self.bias_iteration,
+            "epoch": self.epoch,
+            "n_tuples": self.n_tuples,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class S1Stream:
+    """A stream made ready for the compiled loops: done once a fit."""
+
+    data: Transitions
+    visited: np.ndarray  # [S, A] bool
+    pair: np.ndarray  # [N] int32, s * A + a
+    pair_next: np.ndarray  # [N] int32, s' * A + a'
+    reward: np.ndarray  # [S*A]; all 0 where `noisy`
+    factor: np.ndarray  # [N] exp(beta r) where `noisy`, else [1]
+    noisy: bool  # rewards vary for the same (s, a)
+    decay: np.ndarray  # [S*A], (1 - lr_psi) ** visits
+    psi_map: tuple[np.ndarray, np.ndarray, np.ndarray]  # W, CSR [S*A, S]
+    rho_max: float
+
+
+@dataclass(frozen=True, eq=False)
+class AlgorithmS1:
+    """Algorithm S1, every line of the listing; see the module's docstring for symbols and open points.
+
+    Args:
+        beta: inverse temperature, 1/reward, > 0.
+        lr_u, lr_rho, lr_psi: step sizes in (0, 1] of lines 10, 11 and 2-3; lr_rho None is lr_u / n_states.
+        n_epochs: passes over the stream a u phase.
+        n_bias: biasing iterations, the unbiased first included.
+        psi_tol: relative error between epochs that ends a psi phase.
+        max_psi_epochs: limit on the epochs of a psi phase.
+        prior_policy: [S, A], rows sum to 1 and every entry > 0; None is uniform.
+        rho_init: "reset" (line 8 in each biasing iteration) or "carry" (only in the first).
+        self_loop: "new" or "old": which u(s',a') line 11 sees where (s',a') = (s,a).
+        clip_rho: keep rho <= max(1, exp(beta max r)).
+        rescale_every: tuples between rescalings of u; None is max(5000, S*A).
+        unvisited: "initial" or "prior": what a pair without visits keeps.
+        implementation: "fast" (compiled, on the CPU) or "literal" (the listing, a tuple at a time).
+        device: where the tables live.
+
+    Raises:
+        InputError: an argument out of its range.
+    """
+
+    beta: float = 10.0
+    lr_u: float = 0.005
+    lr_rho: float | None = None
+    lr_psi: float = 0.1
+    n_epochs: int = 15
+    n_bias: int = 6
+    psi_tol: float = 1e-4
+    max_psi_epochs: int = 10_000
+    prior_policy: torch.Tensor | np.ndarray | None = None
+    rho_init: str = "reset"
+    self_loop: str = "new"
+    clip_rho: bool = True
+    rescale_every: int | None = None
+    unvisited: str = "initial"
+    implementation: str = "fast"
+    device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        checks.positive("beta", self.beta)
+        checks.step_size("lr_u", self.lr_u)
+        if self.lr_rho is not None:
+            checks.step_size("lr_rho", self.lr_rho)
+        checks.step_size("lr_psi", self.lr_psi)
+        checks.at_least("n_epochs", self.n_epochs, 1)
+        checks.at_least("n_bias", self.n_bias, 1)
+        checks.positive("psi_tol", self.psi_tol)
+        checks.at_least("max_psi_epochs", self.max_psi_epochs, 1)
+        checks.one_of("rho_init", self.rho_init, ("reset", "carry"))
+        checks.one_of("self_loop", self.self_loop, ("new", "old"))
+        if self.rescale_every is not None:
+            checks.at_least("rescale_every", self.rescale_every, 1)
+        checks.one_of("unvisited", self.unvisited, ("initial", "prior"))
+        checks.one_of("implementation", self.implementation, ("fast", "literal"))
+        checks.device("device", self.device)
+
+    # -- the whole run ------------------------------------------------------------------------------
+
+    def fit(self, transitions: Transitions, n_states: int, n_actions: int) -> Solution:
+        """Run to the end and return the solution.
+
+        A run that leaves the finite numbers ends with ``Status.NON_FINITE``, the tables of the last good
+        epoch and a message with step and cause.
+
+        Raises:
+            InputError: a state or action out of range, or a prior policy of the wrong shape.
+        """
+        state = self.init(n_states, n_actions)
+        history: list[dict[str, float]] = []
+        failure: NonFiniteError | None = None
+        try:
+            for state in self.iterate(transitions, n_states, n_actions):
+                history.append(state.metrics())
+        except NonFiniteError as error:
+            failure = error
+        return self.solution(state, history, failure)
+
+    def iterate(self, transitions: Transitions, n_states: int, n_actions: int) -> Iterator[S1State]:
+        """Yield the state after each epoch of the u phase: n_bias * n_epochs times.
+
+        The caller may log it, save it, or stop. Raises NonFiniteError with step and cause; the state
+        yielded last is then still good.
+        """
+        stream = self.prepare(transitions, n_states, n_actions)
+        state = self.init(n_states, n_actions)
+        for _ in range(self.n_bias * self.n_epochs):
+            state = self.step(state, stream)
+            yield state
+
+    def solution(
+        self,
+        state: S1State,
+        history: list[dict[str, float]] | None = None,
+        failure: NonFiniteError | None = None,
+    ) -> Solution:
+        """The solution that ``state`` stands for; ``history`` holds one ``metrics()`` an epoch."""
+        if failure is not None:
+            status = Status.NON_FINITE
+        elif (state.bias_iteration, state.epoch) != (self.n_bias - 1, self.n_epochs):
+            status = Status.STOPPED
+        else:
+            status = Status.COMPLETED if state.psi_converged else Status.PSI_LIMIT
+        rows = history or []
+        return Solution(
+            policy=state.policy,
+            u=state.u,
+            psi=state.psi,
+            rho=state.rho,
+            theta=state.theta,
+            reward_bias=state.reward_bias,
+            reward_bias_max=state.reward_bias_max,
+            n_steps=state.n_tuples,
+            status=status,
+            message=str(failure) if failure else "",
+            history={name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else {})},
+        )
+
+    # -- its parts, for callers that keep the state themselves --------------------------------------
+
+    def init(self, n_states: int, n_actions: int) -> S1State:
+        """The state before any tuple (line 1): the prior policy, rho = exp(-beta), no bias."""
+        prior = check_policy("prior_policy", self.prior_policy, n_states, n_actions)
+        if not (prior > 0).all():
+            s, a = np.argwhere(prior <= 0)[0]
+            raise InputError(f"prior_policy[{s}, {a}]", prior[s, a], "> 0 (leave the action out instead)")
+        rho = math.exp(-self.beta)
+        if rho == 0.0:
+            raise InputError("beta", self.beta, "below 745, where exp(-beta) leaves double precision")
+        table = torch.zeros(n_states, n_actions, dtype=torch.float64, device=self.device)
+        return S1State(
+            bias_iteration=0,
+            epoch=0,
+            n_tuples=0,
+            beta=self.beta,
+            rho=rho,
+            prior_policy=torch.from_numpy(prior).to(self.device),
+            u=table + 1,
+            psi=torch.ones(n_states, dtype=torch.float64, device=self.device),
+            psi_in_use=torch.ones(n_states, dtype=torch.float64, device=self.device),
+            mean_psi=table + 1,
+            mean_log_psi=table,
+            reward_bias=table,
+            psi_error=0.0,
+            psi_epochs=0,
+        )
+
+    def prepare(self, transitions: Transitions, n_states: int, n_actions: int) -> S1Stream:
+        """Validate the stream against the sizes and compute what is the same in every epoch."""
+        transitions.check_range(n_states, n_actions)
+        n_pairs = n_states * n_actions
+        if n_pairs > np.iinfo(np.int32).max:
+            raise InputError("n_states * n_actions", n_pairs, "below 2**31")
+        pair = transitions.s * np.int32(n_actions) + transitions.a
+        counts = kernels.visit_counts(pair, n_pairs)
+        reward = np.zeros(n_pairs)
+        reward[pair] = transitions.r
+        noisy = bool((reward[pair] != transitions.r).any())
+        largest = self.beta * float(transitions.r.max())
+        if largest > 700:
+            raise NonFiniteError(0, f"exp(beta r) overflows at beta*max(r) = {largest:.6g}: lower beta or shift r")
+        rho_max = max(1.0, math.exp(largest)) if self.clip_rho else math.inf
+        return S1Stream(
+            data=transitions,
+            visited=(counts > 0).reshape(n_states, n_actions),
+            pair=pair,
+            pair_next=transitions.s_next * np.int32(n_actions) + transitions.a_next,
+            reward=np.zeros(n_pairs) if noisy else reward,
+            factor=np.exp(self.beta * transitions.r) if noisy else np.ones(1),
+            noisy=noisy,
+            decay=(1 - self.lr_psi) ** counts.astype(np.float64),
+            psi_map=kernels.psi_map(pair, transitions.s_next, counts, n_states, self.lr_psi),
+            rho_max=rho_max,
+        )
+
+    def step(self, state: S1State, stream: S1Stream) -> S1State:
+        """One epoch of lines 9-12, and before the first of a biasing iteration lines 2-8.
+
+        Pure: ``state`` is left as it is. Raises NonFiniteError.
+        """
+        with np.errstate(all="ignore"):  # what matters is caught by name, with its step
+            if state.epoch == self.n_epochs:
+                state = replace(state, bias_iteration=state.bias_iteration + 1, epoch=0)
+            if state.epoch == 0:
+                state = self._new_biases(state, stream)
+            run = self._u_epoch_fast if self.implementation == "fast" else self._u_epoch_literal
+            u, rho, done = run(state, stream)
+            n_tuples = state.n_tuples + len(stream.data)
+            if done < len(stream.data):
+                raise self._failure(state, stream, done)
+            if self.unvisited == "prior":
+                u = _fill_with_prior(u, state.prior_policy, torch.from_numpy(stream.visited).to(u.device))
+            u = u / u.mean()
+            psi = 1 / (state.prior_policy * u).sum(1)  # line 12
+            after = replace(state, epoch=state.epoch + 1, n_tuples=n_tuples, rho=rho, u=u, psi=psi)
+            if not (_positive(u) and _positive(psi) and _positive((state.prior_policy * u).sum(1))):
+                raise NonFiniteError(
+                    n_tuples, f"u spans more than double precision holds at beta={self.beta:g}: lower beta"
+                )
+        return after
+
+    # -- lines --------------------------------------------------------------------------------------
+
+    def _new_biases(self, state: S1State, stream: S1Stream) -> S1State:
+        """Lines 2-8."""
+        run = self._psi_phase_fast if self.implementation == "fast" else self._psi_phase_literal
+        mean_psi, mean_log_psi, epochs, error = run(state, stream)
+        reward_bias = (mean_psi.log() - mean_log_psi) / self.beta  # line 5
+        # <psi> >= exp(<log psi>) by Jensen; the two running means keep that up to rounding.
+        reward_bias = reward_bias.clamp(min=0.0)
+        if not (_positive(mean_psi) and torch.isfinite(reward_bias).all()):
+            raise NonFiniteError(
+                state.n_tuples,
+                f"psi spans more than double precision holds in biasing iteration {state.bias_iteration} "
+                f"at beta={self.beta:g}: lower beta",
+            )
+        reset = self.rho_init == "reset" or state.bias_iteration == 0
+        return replace(
+            state,
+            psi_in_use=state.psi,
+            mean_psi=mean_psi,
+            mean_log_psi=mean_log_psi,
+            reward_bias=reward_bias,
+            psi_epochs=epochs,
+            psi_error=error,
+            psi_converged=state.psi_converged and error < self.psi_tol,
+            u=torch.ones_like(state.u),  # line 7
+            rho=math.exp(-self.beta) if reset else state.rho,  # line 8
+        )
+
+    def _psi_phase_fast(
+        self, state: S1State, stream: S1Stream
+    ) -> tuple[torch.Tensor, torch.Tensor, int, float]:
+        mean_psi, mean_log_psi = state.mean_psi.cpu().clone(), state.mean_log_psi.cpu().clone()
+        psi = state.psi.cpu().numpy()
+        epochs, error = kernels.psi_phase(
+            *stream.psi_map,
+            stream.decay,
+            psi,
+            np.log(psi),
+            mean_psi.view(-1).numpy(),
+            mean_log_psi.view(-1).numpy(),
+            self.psi_tol,
+            LOG_PSI_EPSILON,
+            self.max_psi_epochs,
+        )
+        return mean_psi.to(self.device), mean_log_psi.to(self.device), epochs, error
+
+    def _psi_phase_literal(
+        self, state: S1State, stream: S1Stream
+    ) -> tuple[torch.Tensor, torch.Tensor, int, float]:
+        mean_psi, mean_log_psi = state.mean_psi.clone(), state.mean_log_psi.clone()
+        psi = state.psi
+        error = math.inf
+        epochs = 0
+        while epochs < self.max_psi_epochs and not error < self.psi_tol:
+            epochs += 1
+            before, log_before = mean_psi.clone(), mean_log_psi.clone()
+            tables = (_walkable(t) for t in (psi, psi.log(), mean_psi, mean_log_psi))
+            listing.psi_epoch(stream.data, *tables, lr_psi=self.lr_psi)
+            error = max(
+                float(((mean_psi - before).abs() / before).max()),
+                float(((mean_log_psi - log_before).abs() / (log_before.abs() + LOG_PSI_EPSILON)).max()),
+            )
+        return mean_psi, mean_log_psi, epochs, error
+
+    def _u_epoch_fast(self, state: S1State, stream: S1Stream) -> tuple[torch.Tensor, float, int]:
+        n_states, n_actions = state.u.shape
+        psi = state.psi_in_use.cpu()
+        z = state.u.cpu() * psi[:, None]
+        log_g = self.beta * (stream.reward - state.reward_bias_max) - state.mean_log_psi.cpu().view(-1).numpy()
+        g = np.exp(log_g + np.repeat(np.log(psi.numpy()), n_actions))
+        table = z.view(-1).numpy()  # zero-copy: the kernel writes into z
+        rescale_every = self.rescale_every or max(5000, n_states * n_actions)
+        inv_rho = 1 / state.rho
+        t = 0
+        while t < len(stream.data):
+            stop = min(len(stream.data), t + BLOCK)
+            inv_rho, t = kernels.u_epoch(
+                stream.pair,
+                stream.pair_next,
+                stream.factor,
+                stream.noisy,
+                g,
+                table,
+                inv_rho,
+                self.lr_u,
+                self._lr_rho(n_states),
+                1 / stream.rho_max,
+                self.self_loop == "new",
+                rescale_every,
+                t,
+                stop,
+            )
+            if t < stop:
+                break
+        rho = 1 / inv_rho if inv_rho else math.inf
+        return (z / psi[:, None]).to(self.device), rho, t
+
+    def _u_epoch_literal(self, state: S1State, stream: S1Stream) -> tuple[torch.Tensor, float, int]:
+        u = state.u.clone()
+        rho, t = listing.u_epoch(
+            stream.data,
+            _walkable(state.psi_in_use),
+            _walkable(state.mean_psi),
+            _walkable(state.reward_bias),
+            state.reward_bias_max,
+            _walkable(u),
+            state.rho,
+            beta=self.beta,
+            lr_u=self.lr_u,
+            lr_rho=self._lr_rho(len(u)),
+            rho_max=stream.rho_max,
+            self_loop=self.self_loop,
+            rescale_every=self.rescale_every or max(5000, u.numel()),
+        )
+        return u, rho, t
+
+    def _lr_rho(self, n_states: int) -> float:
+        return self.lr_u / n_states if self.lr_rho is None else self.lr_rho
+
+    def _failure(self, state: S1State, stream: S1Stream, t: int) -> NonFiniteError:
+        data = stream.data
+        return NonFiniteError(
+            state.n_tuples + t + 1,
+            f"u or rho is no longer a positive finite number at tuple {t} "
+            f"(s={data.s[t]}, a={data.a[t]}, r={data.r[t]:g}) of biasing iteration {state.bias_iteration}, "
+            f"epoch {state.epoch + 1}: beta*r = {self.beta * data.r[t]:g}; lower beta or the step sizes",
+        )
+
+
+def _walkable(table: torch.Tensor) -> torch.Tensor | np.ndarray:
+    return table.numpy() if table.device.type == "cpu" else table
+
+
+def _positive(table: torch.Tensor) -> bool:
+    return bool((torch.isfinite(table) & (table > 0)).all())
+
+
+def _fill_with_prior(u: torch.Tensor, prior: torch.Tensor, visited: torch.Tensor) -> torch.Tensor:
+    """u where visited; elsewhere the state's mean over its visited actions, or 1 if it has none."""
+    weight = prior * visited
+    mass = weight.sum(1, keepdim=True)
+    mean = torch.where(mass > 0, (weight * u).sum(1, keepdim=True) / mass, torch.ones_like(mass))
+    return torch.where(visited, u, mean)

@@ -1,0 +1,133 @@
+"""A finite MDP as arrays: transition [S*A, S] sparse, reward [S, A], start [S].
+
+Row ``s * n_actions + a`` of ``transition`` is p(.|s, a). ``reward`` is the expected one-step reward
+(the paper's r(s, a): a function of state and action only). ``start`` is the distribution of the first state.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from erl_torch.checks import InputError
+
+ROW_SUM_TOLERANCE = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class TabularMDP:
+    """A validated finite MDP.
+
+    Args:
+        transition: p(s'|s, a) as a scipy or torch sparse matrix or a dense array, [S*A, S] or [S, A, S];
+            repeated entries are summed.
+        reward: [S, A], reward a step.
+        start: [S], distribution of the first state; None is uniform.
+
+    Raises:
+        InputError: wrong shape, a value that is not finite or negative, a row that does not sum to 1
+            within 1e-9 (the row is named).
+    """
+
+    transition: sp.csr_array  # [S*A, S], float64, sorted, no repeated or zero entries
+    reward: np.ndarray  # [S, A], float64
+    start: np.ndarray = None  # type: ignore[assignment]  # [S], float64
+
+    def __post_init__(self) -> None:
+        reward = _dense("reward", self.reward)
+        if reward.ndim != 2 or 0 in reward.shape:
+            raise InputError("reward", f"array of shape {reward.shape}", "of shape [n_states, n_actions]")
+        n_states, n_actions = reward.shape
+        if not np.isfinite(reward).all():
+            s, a = np.argwhere(~np.isfinite(reward))[0]
+            raise InputError(f"reward[{s}, {a}]", reward[s, a], "finite")
+        transition = _csr(self.transition, n_states, n_actions)
+        _check_rows(transition, n_actions)
+        start = np.full(n_states, 1.0 / n_states) if self.start is None else _dense("start", self.start)
+        if start.shape != (n_states,):
+            raise InputError("start", f"array of shape {start.shape}", f"of shape [{n_states}]")
+        if not (np.isfinite(start).all() and (start >= 0).all()):
+            raise InputError("start", "array", "finite and >= 0 everywhere")
+        if abs(start.sum() - 1) > ROW_SUM_TOLERANCE:
+            raise InputError("start", f"array with sum {start.sum():.12g}", "a distribution (sum 1)")
+        object.__setattr__(self, "transition", transition)
+        object.__setattr__(self, "reward", reward)
+        object.__setattr__(self, "start", start)
+
+    @property
+    def n_states(self) -> int:
+        return int(self.reward.shape[0])
+
+    @property
+    def n_actions(self) -> int:
+        return int(self.reward.shape[1])
+
+
+def check_policy(key: str, policy: Any, n_states: int, n_actions: int) -> np.ndarray:
+    """``policy`` as a float64 array [S, A] whose rows are distributions; None is the uniform policy.
+
+    Raises InputError naming ``key``.
+    """
+    if policy is None:
+        return np.full((n_states, n_actions), 1.0 / n_actions)
+    table = _dense(key, policy)
+    if table.shape != (n_states, n_actions):
+        raise InputError(key, f"array of shape {table.shape}", f"of shape [{n_states}, {n_actions}]")
+    if not (np.isfinite(table).all() and (table >= 0).all()):
+        raise InputError(key, "array", "finite and >= 0 everywhere")
+    bad = np.flatnonzero(np.abs(table.sum(1) - 1) > ROW_SUM_TOLERANCE)
+    if bad.size:
+        raise InputError(f"{key}[{bad[0]}]", f"row with sum {table[bad[0]].sum():.12g}", "a distribution")
+    return table
+
+
+def _dense(key: str, value: Any) -> np.ndarray:
+    if hasattr(value, "detach"):
+        value = value.detach().cpu().numpy()
+    try:
+        return np.ascontiguousarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(key, type(value).__name__, "an array of numbers") from error
+
+
+def _csr(value: Any, n_states: int, n_actions: int) -> sp.csr_array:
+    if hasattr(value, "layout") and hasattr(value, "to_sparse_coo"):  # a torch tensor
+        value = value.detach().cpu()
+        if str(value.layout) != "torch.strided":
+            value = value.to_sparse_coo().coalesce()
+            value = sp.coo_array(
+                (value.values().numpy(), tuple(value.indices().numpy())), shape=tuple(value.shape)
+            )
+    if not sp.issparse(value):
+        value = _dense("transition", value)
+        if value.shape == (n_states, n_actions, n_states):
+            value = value.reshape(n_states * n_actions, n_states)
+    if value.shape != (n_states * n_actions, n_states):
+        raise InputError(
+            "transition",
+            f"array of shape {tuple(value.shape)}",
+            f"of shape [{n_states * n_actions}, {n_states}] to go with reward [{n_states}, {n_actions}]",
+        )
+    csr = sp.csr_array(value, dtype=np.float64, copy=True)
+    csr.sum_duplicates()
+    csr.eliminate_zeros()
+    csr.sort_indices()
+    return csr
+
+
+def _check_rows(transition: sp.csr_array, n_actions: int) -> None:
+    def name(row: int) -> str:
+        return f"transition row {row} (state {row // n_actions}, action {row % n_actions})"
+
+    bad = np.flatnonzero(~(np.isfinite(transition.data) & (transition.data >= 0)))
+    if bad.size:
+        row = int(np.searchsorted(transition.indptr, bad[0], side="right")) - 1
+        raise InputError(name(row), transition.data[bad[0]], "finite and >= 0 everywhere")
+    sums = transition.sum(axis=1)
+    bad = np.flatnonzero(np.abs(sums - 1) > ROW_SUM_TOLERANCE)
+    if bad.size:
+        row = int(bad[0])
+        raise InputError(name(row), f"sum {sums[row]:.12g}", f"1 in sum, within {ROW_SUM_TOLERANCE:g}")

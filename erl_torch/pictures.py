@@ -1,0 +1,162 @@
+"""Pictures as uint8 arrays [height, width, 3], drawn without pyplot and without a display."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+
+from erl_torch.envs.grid_world import MOVES, TILES, GridWorld
+
+DPI = 100
+MAX_PX = 400  # TensorBoard's image cards are about this wide
+TILE_COLOURS = dict(
+    S="#cfe3f7", F="#f7f7f5", R="#e9e7df", H="#5d3a3a", G="#9bd19b", W="#333333", C="#fdf0c4", N="#f6d2a8"
+)
+ARROW = "#1b4f9c"
+WIND = "#b9c6d3"
+
+
+def policy_picture(
+    policy: np.ndarray, grid: GridWorld | None = None, title: str = "", max_px: int = MAX_PX
+) -> np.ndarray:
+    """The policy [S, A]: arrows as long as their probability on a grid, else a table of shades."""
+    if grid is None:
+        return table_picture(policy, title, "pi(a|s)", max_px)
+    figure, axes = _grid_axes(grid, title, max_px)
+    _tiles(axes, grid)
+    _wind(axes, grid)
+    # Out of H and G every action does the same: arrows there would only look like a choice.
+    free = np.flatnonzero(~np.isin(grid.tiles, ["H", "G", "W"]))
+    row, col = np.divmod(free, grid.shape[1])
+    for move, probability in zip(MOVES, policy[free].T, strict=True):
+        dy, dx = move[:, None] * 0.46 * probability
+        axes.quiver(
+            col, row, dx, dy, angles="xy", scale_units="xy", units="xy", scale=1, color=ARROW, width=0.06,
+            headwidth=3.5, headlength=3.5, headaxislength=3, minlength=0.2, zorder=3,
+        )  # fmt: skip
+    return _pixels(figure)
+
+
+def bias_picture(
+    reward_bias: np.ndarray, grid: GridWorld | None = None, title: str = "", max_px: int = MAX_PX
+) -> np.ndarray:
+    """delta(s,a) [S, A], reward: a grid tile shows each action's value on the side it points to."""
+    label = "delta(s,a), reward"
+    if grid is None:
+        return table_picture(reward_bias, title, label, max_px)
+    figure, axes = _grid_axes(grid, title, max_px, bar=True)
+    row, col = np.divmod(np.arange(grid.tiles.size), grid.shape[1])
+    centre = np.stack([col, row], 1)[:, None, None, :]  # [S, 1, 1, 2]
+    step = MOVES[:, ::-1] / 2  # [A, 2] in (x, y)
+    side = step[:, ::-1]  # at right angles to the step
+    corners = np.stack([np.zeros_like(step), step + side, step - side], 1)  # [A, 3, 2]
+    triangles = (centre + corners).reshape(-1, 3, 2)
+    shades = PolyCollection(
+        list(triangles), array=reward_bias.ravel(), cmap="viridis", edgecolors="#ffffff", linewidths=0.3
+    )
+    shades.set_clim(0.0, max(float(reward_bias.max()), 1e-12))
+    axes.add_collection(shades)
+    _letters(axes, grid, "#ffffff")
+    figure.colorbar(shades, ax=axes, label=label, fraction=0.08, pad=0.04)
+    return _pixels(figure)
+
+
+def table_picture(table: np.ndarray, title: str, label: str, max_px: int = MAX_PX) -> np.ndarray:
+    """Any [S, A] table as shades: states down, actions across."""
+    figure = Figure(figsize=(max_px / DPI, max_px / DPI), dpi=DPI, layout="constrained")
+    axes = figure.add_subplot()
+    image = axes.imshow(table, aspect="auto", interpolation="nearest", cmap="viridis")
+    axes.set_xlabel("action a")
+    axes.set_ylabel("state s")
+    axes.set_xticks(range(table.shape[1]) if table.shape[1] <= 12 else [])
+    axes.set_title(title, fontsize=9)
+    figure.colorbar(image, ax=axes, label=label)
+    return _pixels(figure)
+
+
+def board(grid: GridWorld, cell_px: int = 64) -> np.ndarray:
+    """The bare grid with its wind, for ``render``: cell_px (fewer on large grids) pixels a tile."""
+    rows, cols = grid.shape
+    cell_px = max(12, min(cell_px, 1200 // max(rows, cols)))
+    figure = Figure(figsize=(cols * cell_px / DPI, rows * cell_px / DPI), dpi=DPI)
+    axes = figure.add_axes((0, 0, 1, 1))
+    _frame(axes, grid)
+    _tiles(axes, grid)
+    _wind(axes, grid)
+    return _pixels(figure)
+
+
+def with_agent(picture: np.ndarray, shape: tuple[int, int], cell: tuple[int, int]) -> np.ndarray:
+    """A copy of a ``board`` of ``shape`` (rows, cols) with the agent at ``cell`` (row, col)."""
+    height, width = picture.shape[:2]
+    y = (cell[0] + 0.5) * height / shape[0]
+    x = (cell[1] + 0.5) * width / shape[1]
+    radius = 0.27 * min(height / shape[0], width / shape[1])
+    rows, cols = np.ogrid[:height, :width]
+    # One pixel of soft edge.
+    distance = np.hypot(rows + 0.5 - y, cols + 0.5 - x)
+    cover = np.clip(radius - distance + 0.5, 0, 1)[..., None]
+    colour = np.array(to_rgb("#d9480f")) * 255
+    return (picture * (1 - cover) + colour * cover).astype(np.uint8)
+
+
+def _grid_axes(grid: GridWorld, title: str, max_px: int, bar: bool = False) -> tuple[Figure, Axes]:
+    rows, cols = grid.shape
+    height, width = rows + 0.6, cols + (1.6 if bar else 0.0)
+    scale = max_px / max(height, width) / DPI
+    figure = Figure(figsize=(max(width * scale, 2.2), height * scale), dpi=DPI, layout="constrained")
+    axes = figure.add_subplot()
+    axes.set_title(title, fontsize=8)
+    _frame(axes, grid)
+    return figure, axes
+
+
+def _frame(axes: Axes, grid: GridWorld) -> None:
+    rows, cols = grid.shape
+    axes.set_xlim(-0.5, cols - 0.5)
+    axes.set_ylim(rows - 0.5, -0.5)
+    axes.set_aspect("equal")
+    axes.set_axis_off()
+
+
+def _tiles(axes: Axes, grid: GridWorld) -> None:
+    rows, cols = grid.shape
+    colours = np.array([to_rgb(TILE_COLOURS[tile]) for tile in TILES])
+    index = np.array([TILES.index(tile) for tile in grid.tiles]).reshape(rows, cols)
+    axes.imshow(colours[index], interpolation="nearest", zorder=0)
+    lines = {"color": "#ffffff", "linewidth": 1.0, "zorder": 1}
+    axes.hlines(np.arange(rows + 1) - 0.5, -0.5, cols - 0.5, **lines)
+    axes.vlines(np.arange(cols + 1) - 0.5, -0.5, rows - 0.5, **lines)
+    _letters(axes, grid, "#777777", dark="#e8d5d5")
+
+
+def _letters(axes: Axes, grid: GridWorld, colour: str, dark: str | None = None) -> None:
+    if grid.tiles.size > 400:
+        return
+    size = max(5, min(10, 60 // max(grid.shape)))
+    for s, tile in enumerate(grid.tiles):
+        if tile in "SGH":
+            row, col = divmod(s, grid.shape[1])
+            shade = dark if dark and tile == "H" else colour
+            axes.text(col - 0.44, row - 0.42, tile, fontsize=size, color=shade, va="top", zorder=2)
+
+
+def _wind(axes: Axes, grid: GridWorld) -> None:
+    angle, strength = grid.wind.reshape(2, -1)
+    windy = np.flatnonzero((grid.tiles == "F") & (strength > 0))
+    row, col = np.divmod(windy, grid.shape[1])
+    dx, dy = 0.8 * strength[windy] * np.cos(angle[windy]), 0.8 * strength[windy] * np.sin(angle[windy])
+    axes.quiver(
+        col, row, dx, dy, angles="xy", scale_units="xy", units="xy", scale=1, pivot="mid", color=WIND,
+        width=0.1, headwidth=2.5, headlength=2.5, headaxislength=2.5, zorder=1.5,
+    )  # fmt: skip
+
+
+def _pixels(figure: Figure) -> np.ndarray:
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
