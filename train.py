@@ -1,10 +1,16 @@
-"""Train a learner: ``python train.py env=windy_cliff``; ``--help`` shows what can be set."""
+"""Learn the optimal entropy-regularised policy of a stochastic MDP from a stream of tuples.
+
+python train.py env=windy_cliff                        the paper's Figure 5
+python train.py learner.beta=5 experience.n_episodes=200
+python train.py env=gym env.id=FrozenLake-v1           any environment with Discrete spaces
+python train.py -m learner.beta=2,5,10 seed=0,1        one run a combination
+tensorboard --logdir runs                              look at the runs
+"""
 
 from pathlib import Path
 from typing import Any
 
 import hydra
-from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from erl_torch import cli, config
@@ -13,12 +19,13 @@ config.register()
 
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="train")
-def main(cfg: DictConfig) -> Any:
+@cli.job
+def main(cfg: DictConfig, directory: Path) -> Any:
     # Imported here: torch takes seconds, and --help and Tab completion do not need it.
     from erl_torch.training import train
 
-    return train(cfg, Path(HydraConfig.get().runtime.output_dir))["objective"]
+    return train(cfg, directory)["objective"]
 
 
 if __name__ == "__main__":
-    cli.run(main)
+    cli.run(main, __doc__, Path(__file__).parent / "conf", "train")

@@ -34,7 +34,7 @@ class Board:
         self._writer.add_custom_scalars(LAYOUT)
         # Session start and end go into the run's own file: add_hparams would open a run directory more.
         # No experiment summary: TensorBoard takes the first it finds and hides other runs' columns.
-        _, self._session_start, self._session_end = hparams(dict(hyperparameters), {})
+        _, self._session_start, self._session_end = hparams(dict(hyperparameters), {})  # type: ignore[no-untyped-call]
         self._summary(self._session_start)
 
     def scalars(self, values: Mapping[str, float], step: int) -> None:

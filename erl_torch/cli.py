@@ -1,77 +1,141 @@
-"""From exceptions to one clear line and an exit code: 1 for bad input, 2 for usage."""
+"""Around ``hydra.main``: help, and errors as one clear line with exit code 1 (bad input) or 2 (usage)."""
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import os
 import re
+import shutil
 import signal
 import sys
 from collections.abc import Callable
+from dataclasses import fields, is_dataclass
+from pathlib import Path
 from typing import Any
 
+from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, OverrideParseException
 from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from erl_torch.checks import InputError
 
+BY_RUN = (InputError, ArithmeticError, OSError)
+BY_CONFIGURATION = (HydraException, OmegaConfBaseException)
+OPEN_NODES = ("env.kwargs.",)  # keys of the user's own: no schema lists them
 
-def run(main: Callable[[], Any]) -> None:
-    """Call a ``hydra.main`` function; errors of input become one line on stderr and an exit code.
+
+def job(work: Callable[[DictConfig, Path], Any]) -> Callable[[DictConfig], Any]:
+    """A Hydra task out of ``work(cfg, run_directory)``.
+
+    Bad input ends a single run with one line and exit code 1, and fails that job alone in a multirun;
+    a run directory in which nothing was written goes again.
+    """
+
+    @functools.wraps(work)
+    def task(cfg: DictConfig) -> Any:
+        hydra = HydraConfig.get()
+        directory = Path(hydra.runtime.output_dir)
+        try:
+            return work(cfg, directory)
+        except Exception as error:
+            if not isinstance(error, BY_RUN):
+                raise
+            if {entry.name for entry in directory.iterdir()} <= {".hydra"}:
+                shutil.rmtree(directory)
+                with contextlib.suppress(OSError):  # not empty: other runs
+                    directory.parent.rmdir()
+            if hydra.mode != RunMode.MULTIRUN:
+                raise SystemExit(_report(error)) from error
+            print(f"error: job {hydra.job.num} ({hydra.job.override_dirname}): {_line(error)}", file=sys.stderr)
+            raise
+
+    return task
+
+
+def run(main: Callable[[], Any], about: str, conf: Path, config_name: str) -> None:
+    """Call a ``hydra.main`` function with our help and error lines.
+
+    Args:
+        main: the decorated function.
+        about: head of the help text.
+        conf: the configuration directory.
+        config_name: the primary configuration.
 
     With HYDRA_FULL_ERROR=1 in the environment every traceback is shown.
     """
-    signal.signal(signal.SIGTERM, _terminate)
-    if os.environ.get("HYDRA_FULL_ERROR"):
-        main()
-        return
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
+    arguments = sys.argv[1:]
+    # Keys that no schema lists need Hydra's "++"; the user need not know.
+    arguments = [f"++{a}" if a.startswith(OPEN_NODES) else a for a in arguments]
+    sys.argv[1:] = arguments
+    full = bool(os.environ.get("HYDRA_FULL_ERROR"))
     # Hydra then raises what it would otherwise print over several lines.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     try:
+        if {"-h", "--help"} & set(arguments):
+            print(_help(about, conf, config_name, [a for a in arguments if not a.startswith("-")]))
+            return
         main()
-    except OverrideParseException as error:
-        _fail(f"{error.override}: not of the form key=value ({_one_line(error)})", 2)
-    except (HydraException, OmegaConfBaseException) as error:
-        _fail(_explain(error), 1)
-    except (InputError, ArithmeticError) as error:
-        _fail(str(error), 1)
-    except OSError as error:
-        _fail(f"{error.filename or 'file system'}: {error.strerror or error}", 1)
     except KeyboardInterrupt:
-        _fail("stopped by Ctrl-C; what was logged is on disk", 130)
+        print("stopped by Ctrl-C; what was logged is on disk", file=sys.stderr)
+        raise SystemExit(130) from None
+    except Exception as error:
+        if isinstance(error, BY_CONFIGURATION) and not full:
+            raise SystemExit(_report(error)) from None
+        if isinstance(error, BY_RUN) and not full:
+            raise SystemExit(1) from None  # a job of a multirun, which has said its own line
+        raise
 
 
-def is_multirun() -> bool:
-    """Whether the running job is one of a multirun."""
-    return bool(HydraConfig.get().mode == RunMode.MULTIRUN)
+def _help(about: str, conf: Path, config_name: str, overrides: list[str]) -> str:
+    with initialize_config_dir(str(conf.resolve()), version_base="1.3"):
+        cfg = compose(config_name, overrides)
+    choices = [
+        f"  {group.name}={{{','.join(sorted(option.stem for option in group.glob('*.yaml')))}}}"
+        for group in sorted(conf.iterdir())
+        if group.is_dir()
+    ]
+    head = [about.rstrip(), "", "Choices:", *choices, "", "Keys and values (each is explained in conf/):", ""]
+    return "\n".join(head) + "\n" + OmegaConf.to_yaml(cfg).rstrip()
 
 
-def _terminate(number: int, frame: Any) -> None:
-    raise SystemExit(128 + number)
+def _report(error: Exception) -> int:
+    """Print the one line; the exit code."""
+    print(f"error: {_line(error)}", file=sys.stderr)
+    return 2 if isinstance(error, OverrideParseException) else 1
 
 
-def _fail(line: str, code: int) -> None:
-    print(f"error: {line}", file=sys.stderr)
-    raise SystemExit(code)
+def _line(error: Exception) -> str:
+    if isinstance(error, OverrideParseException):
+        return f"{error.override}: not of the form key=value"
+    if isinstance(error, BY_CONFIGURATION):
+        return _explain(error)
+    if isinstance(error, OSError):
+        return f"{error.filename or 'file system'}: {error.strerror or error}"
+    return str(error)
 
 
-def _explain(error: BaseException) -> str:
-    """One line out of Hydra's and OmegaConf's several: the override if it is named, then the reason."""
-    override = re.search(r"(?:override|Error merging override) '?([^\s']+)'?", str(error))
+def _explain(error: Exception) -> str:
+    """One line out of the several of Hydra and OmegaConf: the override where it is named, then the reason."""
     reason = error.__cause__ if isinstance(error.__cause__, OmegaConfBaseException) else error
-    text = _one_line(reason)
-    missing = re.match(r"In '[^']+': Could not find '([^/]+(?:/[^/]+)*)/([^']+)' Available options .*?: (.+?)(?: Config|$)", text)
+    said = str(reason)
+    choice = re.search(r"Could not find '(\S+)/([^'/]+)'\s+Available options in '[^']*':\n((?:\t\S+\n?)+)", said)
+    if choice:
+        group, name, options = choice.groups()
+        return str(InputError(group, name, " or ".join(options.split())))
+    missing = re.search(r"Missing mandatory value: (\S+)", said)
     if missing:
-        group, choice, options = missing.groups()
-        return f"{group}={choice}: must be one of {', '.join(options.split())}"
-    key = getattr(reason, "full_key", None)
-    name = override.group(1) if override else key
-    return f"{name}: {text}" if name and name not in text else text
-
-
-def _one_line(error: BaseException) -> str:
-    text = str(error)
-    text = re.sub(r"\n\s*(full_key|object_type|reference_type):[^\n]*", "", text)
-    text = re.sub(r"\nTo append to your config use[^\n]*", "", text)
-    return " ".join(text.split())
+        return str(InputError(missing[1], "???", f"given, as in {missing[1]}=VALUE"))
+    override = re.search(r"(?:Error merging override|Could not override) '?([^\s']+?)'?\.?(?:\s|$)", str(error))
+    subject = override[1] if override else getattr(reason, "full_key", None)
+    schema = getattr(reason, "object_type", None)
+    if re.search(r"Key '[^']*' (is )?not in", said) and is_dataclass(schema):
+        names = [field.name for field in fields(schema) if field.name != "name"]
+        given = next((a for a in sys.argv[1:] if a.lstrip("+~").startswith(f"{subject}=")), subject)
+        return f"{given}: no such key; there are {', '.join(names)}"
+    text = " ".join(re.sub(r"\n\s*(full_key|object_type|reference_type)[:=][^\n]*", "", said).split())
+    return f"{subject}: {text}" if subject and subject not in text else text

@@ -130,11 +130,9 @@ def check_keys(cfg: DictConfig) -> None:
 
 
 def _check_node(node: DictConfig, schema: Any, prefix: str) -> None:
-    known = [f.name for f in fields(schema)] if is_dataclass(schema) else []
-    for key in node:
-        if key not in known:
-            value = OmegaConf.to_container(node, throw_on_missing=False)[key]  # type: ignore[call-overload,index]
-            raise InputError(f"{prefix}{key}", value, f"left out: no such key; there are {', '.join(known)}")
-    for key in known:
-        if OmegaConf.is_missing(node, key):
-            raise InputError(f"{prefix}{key}", "???", f"given, as in {prefix}{key}=VALUE")
+    known = [field.name for field in fields(schema)] if is_dataclass(schema) else []
+    for name in map(str, node):
+        if name not in known:
+            raise InputError(prefix + name, node[name], f"left out: no such key; there are {', '.join(known)}")
+        if OmegaConf.is_missing(node, name):
+            raise InputError(prefix + name, "???", f"given, as in {prefix}{name}=VALUE")

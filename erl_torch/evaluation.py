@@ -38,9 +38,7 @@ def policy_chain(mdp: TabularMDP, policy: np.ndarray) -> PolicyChain:
     """The chain of ``policy`` [S, A]."""
     n_states, n_actions = policy.shape
     n = n_states * n_actions
-    choose = sp.csr_array(
-        (policy.ravel(), np.arange(n), np.arange(0, n + 1, n_actions)), shape=(n_states, n)
-    )
+    choose = sp.csr_array((policy.ravel(), np.arange(n), np.arange(0, n + 1, n_actions)), shape=(n_states, n))
     return PolicyChain(sp.csr_array(choose @ mdp.transition), (policy * mdp.reward).sum(1))
 
 
@@ -125,7 +123,8 @@ def evaluate(
     prior = check_policy("prior_policy", prior_policy, n_states, n_actions)
     mdp = known_mdp(source)
     if mdp is None:
-        return _evaluate_by_stepping(source, table, prior, beta, rng, n_episodes, horizon)  # type: ignore[arg-type]
+        assert not isinstance(source, TabularMDP)
+        return _evaluate_by_stepping(source, table, prior, beta, rng, n_episodes, horizon)
     returns = np.empty(n_episodes)
     kernels.simulate_returns(*sampling_tables(mdp), policy_cdf(table), horizon, rng, returns)
     return Evaluation(

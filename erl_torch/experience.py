@@ -84,6 +84,7 @@ def collect(
     mdp = known_mdp(source)
     if mdp is not None:
         return _simulate(mdp, n_episodes, episode_length, rng, behaviour, prior, on_prior, report)
+    assert not isinstance(source, TabularMDP)
     return _step_through(source, n_episodes, episode_length, rng, behaviour, prior, on_prior, report)
 
 
@@ -129,7 +130,8 @@ def sampling_tables(mdp: TabularMDP) -> tuple[np.ndarray, ...]:
 def policy_cdf(policy: np.ndarray) -> np.ndarray:
     """Running sums of each row, flat [S*A]."""
     n_states, n_actions = policy.shape
-    return kernels.cumulative_rows(np.arange(0, n_states * n_actions + 1, n_actions), policy.ravel())
+    rows = np.arange(0, n_states * n_actions + 1, n_actions)
+    return np.asarray(kernels.cumulative_rows(rows, policy.ravel()))
 
 
 def _step_through(

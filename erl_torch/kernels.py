@@ -69,9 +69,7 @@ def psi_map(pair, s_next, counts, n_states, lr_psi):
 
 
 @numba.njit(cache=True)
-def psi_phase(
-    indptr, indices, data, decay, psi, log_psi, mean_psi, mean_log_psi, tolerance, epsilon, max_epochs
-):
+def psi_phase(indptr, indices, data, decay, psi, log_psi, mean_psi, mean_log_psi, tolerance, epsilon, max_epochs):
     """Lines 2-3 until the relative change between epochs is below ``tolerance``; tables change in place.
 
     Each epoch costs O(n_pairs), whatever the number of tuples. Returns (epochs, last relative change).
@@ -166,16 +164,12 @@ def u_epoch(
         stop = min(end, t - t % rescale_every + rescale_every)
         backup[:] = z
         q_before = q
-        q = _u_chunk(
-            pair, pair_next, factor, noisy, g, z, q, lr_u, lr_rho, inv_rho_min, new, t, stop
-        )
+        q = _u_chunk(pair, pair_next, factor, noisy, g, z, q, lr_u, lr_rho, inv_rho_min, new, t, stop)
         if not _is_healthy(z, q):
             z[:] = backup
             q = q_before
             for bad in range(t, stop):
-                q = _u_chunk(
-                    pair, pair_next, factor, noisy, g, z, q, lr_u, lr_rho, inv_rho_min, new, bad, bad + 1
-                )
+                q = _u_chunk(pair, pair_next, factor, noisy, g, z, q, lr_u, lr_rho, inv_rho_min, new, bad, bad + 1)
                 k = pair[bad]
                 if not (np.isfinite(q) and q > 0.0 and np.isfinite(z[k]) and z[k] > 0.0):
                     return q, bad
@@ -289,7 +283,7 @@ def simulate_returns(indptr, indices, cdf, reward, start_cdf, policy_cdf, episod
 
 @numba.njit(cache=True)
 def finite_horizon_return(indptr, indices, data, reward, start, horizon):
-    """Expected undiscounted sum of ``reward`` [S] over ``horizon`` steps of the chain (CSR [S, S]) from ``start``."""
+    """Expected undiscounted sum of ``reward`` [S] over ``horizon`` steps of a chain (CSR [S, S])."""
     now = start.copy()
     after = np.empty_like(now)
     total = 0.0

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
@@ -13,9 +16,16 @@ from erl_torch.envs.grid_world import MOVES, TILES, GridWorld
 
 DPI = 100
 MAX_PX = 400  # TensorBoard's image cards are about this wide
-TILE_COLOURS = dict(
-    S="#cfe3f7", F="#f7f7f5", R="#e9e7df", H="#5d3a3a", G="#9bd19b", W="#333333", C="#fdf0c4", N="#f6d2a8"
-)
+TILE_COLOURS = {
+    "S": "#cfe3f7",
+    "F": "#f7f7f5",
+    "R": "#e9e7df",
+    "H": "#5d3a3a",
+    "G": "#9bd19b",
+    "W": "#333333",
+    "C": "#fdf0c4",
+    "N": "#f6d2a8",
+}
 ARROW = "#1b4f9c"
 WIND = "#b9c6d3"
 
@@ -61,20 +71,20 @@ def bias_picture(
     shades.set_clim(0.0, max(float(reward_bias.max()), 1e-12))
     axes.add_collection(shades)
     _letters(axes, grid, "#ffffff")
-    figure.colorbar(shades, ax=axes, label=label, fraction=0.08, pad=0.04)
+    _bar(figure, shades, label)
     return _pixels(figure)
 
 
 def table_picture(table: np.ndarray, title: str, label: str, max_px: int = MAX_PX) -> np.ndarray:
     """Any [S, A] table as shades: states down, actions across."""
-    figure = Figure(figsize=(max_px / DPI, max_px / DPI), dpi=DPI, layout="constrained")
-    axes = figure.add_subplot()
+    figure = Figure(figsize=(max_px / DPI, max_px / DPI), dpi=DPI)
+    axes = figure.add_axes((0.13, 0.12, 0.65, 0.8))
     image = axes.imshow(table, aspect="auto", interpolation="nearest", cmap="viridis")
     axes.set_xlabel("action a")
     axes.set_ylabel("state s")
     axes.set_xticks(range(table.shape[1]) if table.shape[1] <= 12 else [])
     axes.set_title(title, fontsize=9)
-    figure.colorbar(image, ax=axes, label=label)
+    _bar(figure, image, label)
     return _pixels(figure)
 
 
@@ -101,18 +111,27 @@ def with_agent(picture: np.ndarray, shape: tuple[int, int], cell: tuple[int, int
     distance = np.hypot(rows + 0.5 - y, cols + 0.5 - x)
     cover = np.clip(radius - distance + 0.5, 0, 1)[..., None]
     colour = np.array(to_rgb("#d9480f")) * 255
-    return (picture * (1 - cover) + colour * cover).astype(np.uint8)
+    return np.asarray(picture * (1 - cover) + colour * cover, dtype=np.uint8)
 
 
 def _grid_axes(grid: GridWorld, title: str, max_px: int, bar: bool = False) -> tuple[Figure, Axes]:
     rows, cols = grid.shape
-    height, width = rows + 0.6, cols + (1.6 if bar else 0.0)
-    scale = max_px / max(height, width) / DPI
-    figure = Figure(figsize=(max(width * scale, 2.2), height * scale), dpi=DPI, layout="constrained")
-    axes = figure.add_subplot()
-    axes.set_title(title, fontsize=8)
+    top, right = 24, 80 if bar else 6  # px: the title's line, the colour bar
+    px = min((max_px - top - 6) / rows, (max_px - right - 6) / cols)  # a tile
+    width, height = max(px * cols + right + 6, 220), px * rows + top + 6
+    figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI)
+    axes = figure.add_axes((6 / width, 6 / height, 1 - (right + 6) / width, 1 - (top + 6) / height))
+    figure.text(0.5, 1 - 6 / height, title, fontsize=8, ha="center", va="top")
     _frame(axes, grid)
     return figure, axes
+
+
+# The layouts are fixed: matplotlib's own layout engines take longer than the rest of the picture.
+def _bar(figure: Figure, shades: ScalarMappable, label: str) -> None:
+    width = figure.get_figwidth() * DPI
+    bar = figure.colorbar(shades, cax=figure.add_axes((1 - 72 / width, 0.12, 12 / width, 0.76)))
+    bar.ax.tick_params(labelsize=7)
+    bar.set_label(label, fontsize=8)
 
 
 def _frame(axes: Axes, grid: GridWorld) -> None:
@@ -128,7 +147,7 @@ def _tiles(axes: Axes, grid: GridWorld) -> None:
     colours = np.array([to_rgb(TILE_COLOURS[tile]) for tile in TILES])
     index = np.array([TILES.index(tile) for tile in grid.tiles]).reshape(rows, cols)
     axes.imshow(colours[index], interpolation="nearest", zorder=0)
-    lines = {"color": "#ffffff", "linewidth": 1.0, "zorder": 1}
+    lines: dict[str, Any] = {"color": "#ffffff", "linewidth": 1.0, "zorder": 1}
     axes.hlines(np.arange(rows + 1) - 0.5, -0.5, cols - 0.5, **lines)
     axes.vlines(np.arange(cols + 1) - 0.5, -0.5, rows - 0.5, **lines)
     _letters(axes, grid, "#777777", dark="#e8d5d5")

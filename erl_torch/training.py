@@ -27,7 +27,7 @@ from erl_torch.checks import InputError
 from erl_torch.config import check_keys
 from erl_torch.envs.grid_world import GridWorld
 from erl_torch.evaluation import Evaluation, evaluate
-from erl_torch.experience import collect, known_mdp, sizes
+from erl_torch.experience import collect, sizes
 from erl_torch.files import read_npy, write_json
 from erl_torch.learners import LEARNERS, NonFiniteError, S1State
 from erl_torch.mdp import check_policy
@@ -62,11 +62,11 @@ def train(cfg: DictConfig, directory: Path) -> dict[str, Any]:
             e = cfg.evaluation
             return evaluate(env, policy, learner.beta, rng.evaluation, e.n_episodes, e.horizon, prior)
 
-        hyperparameters = _flat({**cfg.learner, "seed": cfg.seed, "n_tuples": len(data)})
-        failure: NonFiniteError | None = None
+        start = state = learner.init(n_states, n_actions)
         history: list[dict[str, float]] = []
-        state = learner.init(n_states, n_actions)
-        learning = 0.0
+        stopped: BaseException | None = None
+        clock = _Stopwatch()
+        hyperparameters = _flat({**cfg.learner, "seed": cfg.seed, "n_experience": len(data)})
         with Board(directory, hyperparameters) as board:
             board.text("configuration", f"```yaml\n{OmegaConf.to_yaml(cfg, resolve=True)}```")
             first = last = measure(state.policy)
@@ -74,39 +74,51 @@ def train(cfg: DictConfig, directory: Path) -> dict[str, Any]:
             drawer = _Drawer(board, getattr(env.unwrapped, "grid", None)) if cfg.evaluation.pictures else None
             if drawer:
                 drawer.policy(state, "prior policy")
-            progress = _Progress(learner, len(data))
-            epochs = learner.iterate(data, n_states, n_actions)
-            with progress:
-                while True:
-                    tick = time.perf_counter()
-                    try:
-                        new = next(epochs, None)
-                    except NonFiniteError as error:
-                        failure = error
-                        break
-                    learning += time.perf_counter() - tick
-                    if new is None:
-                        break
-                    state = new
-                    ends_phase = state.epoch == learner.n_epochs
-                    history.append(state.metrics())
-                    if ends_phase or len(history) % cfg.evaluation.every == 0:
-                        last = measure(state.policy)
-                        board.scalars(_tags(state, last), state.n_tuples)
-                    if ends_phase and drawer:
-                        drawer.policy(state, f"policy, biasing iteration {state.bias_iteration}")
-                        drawer.bias(state)
-                    progress.advance(state, last, ends_phase)
+            # Whatever ends the loop, what was learnt until then is written below.
+            try:
+                with _Progress(learner, len(data)) as progress:
+                    for state in clock.time(learner.iterate(data, n_states, n_actions)):
+                        history.append(state.metrics())
+                        ends_phase = state.epoch == learner.n_epochs
+                        if ends_phase or len(history) % cfg.evaluation.every == 0:
+                            last = measure(state.policy)
+                            board.scalars(_tags(state, last), state.n_tuples)
+                        if ends_phase and drawer:
+                            drawer.policy(state, f"policy, biasing iteration {state.bias_iteration}")
+                            drawer.bias(state)
+                        progress.advance(state, last, ends_phase)
+            except (NonFiniteError, KeyboardInterrupt, SystemExit) as error:
+                stopped = error
+            failure = stopped if isinstance(stopped, NonFiniteError) else None
             solution = learner.solution(state, history, failure)
-            board.scalars({"time/tuples_per_second": state.n_tuples / max(learning, 1e-9)}, state.n_tuples)
+            rate = state.n_tuples / max(clock.seconds, 1e-9)
+            board.scalars({"time/tuples_per_second": rate}, state.n_tuples)
 
     solution.save(directory / "solution.npz")
-    result = _result(cfg, solution, last, len(data), learning, time.perf_counter() - began)
+    result = _result(cfg, solution, last, len(data), clock.seconds, time.perf_counter() - began)
     write_json(directory / "result.json", result)
-    print(_summary(cfg, first, last, learner.init(n_states, n_actions), result, directory))
-    if failure is not None:
-        raise failure
+    print(_summary(cfg, first, last, start, result, directory))
+    if stopped is not None:
+        raise stopped
     return result
+
+
+class _Stopwatch:
+    """Seconds spent inside an iterator, apart from what its caller does between the items."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+
+    def time(self, states: Iterator[S1State]) -> Iterator[S1State]:
+        while True:
+            tick = time.perf_counter()
+            try:
+                state = next(states)
+            except StopIteration:
+                return
+            finally:
+                self.seconds += time.perf_counter() - tick
+            yield state
 
 
 # -- from configuration to objects ------------------------------------------------------------------
@@ -122,7 +134,10 @@ def _group(name: str) -> Iterator[None]:
 
 
 def _make_env(cfg: DictConfig) -> gym.Env[Any, Any]:
-    arguments = dict(cfg.kwargs) if "kwargs" in cfg else {k: v for k, v in cfg.items() if k not in ("name", "id")}
+    if "kwargs" in cfg:
+        arguments = {str(key): value for key, value in cfg.kwargs.items()}
+    else:
+        arguments = {str(key): value for key, value in cfg.items() if key not in ("name", "id")}
     with _group("env"):
         try:
             return gym.make(cfg.id, **arguments)
@@ -219,8 +234,9 @@ class _Progress:
             bar_format="{l_bar}{bar:20}| {elapsed}<{remaining}, {rate_fmt}{postfix}",
         )  # fmt: skip
 
-    def __enter__(self) -> None:
+    def __enter__(self) -> _Progress:
         self.bar.__enter__()
+        return self
 
     def __exit__(self, *error: Any) -> None:
         self.bar.__exit__(*error)
@@ -289,7 +305,7 @@ def _summary(
         f"{cfg.env.name}, {cfg.learner.name}, beta {cfg.learner.beta:g}, seed {cfg.seed}: {result['status']}",
         f"{'':18}{'prior':>12}{'learnt':>12}",
         *(f"{name:18}{before}{after}" for name, before, after in rows),
-        f"{'tuples streamed':18}{result['n_tuples']:,} (of {result['n_experience']:,}; {rate:.0f} M/s)",
+        f"{'tuples streamed':18}{result['n_tuples']:,} (of {result['n_experience']:,}; {rate:.3g} M/s)",
         f"{'seconds':18}{result['seconds']:.1f}, of which {result['seconds_learning']:.1f} learning",
         f"{'run directory':18}{directory}",
         f"{'look at it':18}tensorboard --logdir runs",

@@ -17,7 +17,7 @@ Rules (state = row * n_cols + col, row 0 on top; actions 0..3 = left, down, righ
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -48,7 +48,7 @@ class GridWorld:
     """
 
     desc: tuple[str, ...]
-    wind: np.ndarray = field(default=None)  # type: ignore[assignment]  # [2, rows, cols]
+    wind: np.ndarray = None  # type: ignore[assignment]  # [2, rows, cols]
     trap_reward: float = -5.0
     action_success_prob: Sequence[float] = (1.0, 1.0, 1.0, 1.0)
 

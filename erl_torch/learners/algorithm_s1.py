@@ -387,9 +387,7 @@ class AlgorithmS1:
             rho=math.exp(-self.beta) if reset else state.rho,  # line 8
         )
 
-    def _psi_phase_fast(
-        self, state: S1State, stream: S1Stream
-    ) -> tuple[torch.Tensor, torch.Tensor, int, float]:
+    def _psi_phase_fast(self, state: S1State, stream: S1Stream) -> tuple[torch.Tensor, torch.Tensor, int, float]:
         mean_psi, mean_log_psi = state.mean_psi.cpu().clone(), state.mean_log_psi.cpu().clone()
         psi = state.psi.cpu().numpy()
         epochs, error = kernels.psi_phase(
@@ -415,8 +413,14 @@ class AlgorithmS1:
         while epochs < self.max_psi_epochs and not error < self.psi_tol:
             epochs += 1
             before, log_before = mean_psi.clone(), mean_log_psi.clone()
-            tables = (_walkable(t) for t in (psi, psi.log(), mean_psi, mean_log_psi))
-            listing.psi_epoch(stream.data, *tables, lr_psi=self.lr_psi)
+            listing.psi_epoch(
+                stream.data,
+                _walkable(psi),
+                _walkable(psi.log()),
+                _walkable(mean_psi),
+                _walkable(mean_log_psi),
+                self.lr_psi,
+            )
             error = max(
                 float(((mean_psi - before).abs() / before).max()),
                 float(((mean_log_psi - log_before).abs() / (log_before.abs() + LOG_PSI_EPSILON)).max()),
