@@ -1,6 +1,7 @@
 """Every compiled loop of the package.
 
 Kernels take plain C-contiguous arrays and scalars, use no globals, and validate nothing: the callers do.
+``error_model="numpy"``: a division by zero gives inf or nan for the caller to find, and no check costs time.
 They stand in one file because Numba's cache does not notice a changed kernel in another file.
 
 Pair index: ``k = s * n_actions + a``. Transition matrices come as CSR arrays (indptr, indices, data).
@@ -18,7 +19,7 @@ import numpy as np
 # ---------------------------------------------------------------------------------------------------
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def visit_counts(pair, n_pairs):
     """Visits of every pair. pair [N] int32 -> [n_pairs] int64."""
     counts = np.zeros(n_pairs, np.int64)
@@ -27,7 +28,7 @@ def visit_counts(pair, n_pairs):
     return counts
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def psi_map(pair, s_next, counts, n_states, lr_psi):
     """W of one psi epoch as CSR [n_pairs, n_states]; the decay is (1 - lr_psi)**counts.
 
@@ -68,7 +69,7 @@ def psi_map(pair, s_next, counts, n_states, lr_psi):
     return indptr, indices[:n].copy(), data[:n].copy()
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def psi_phase(indptr, indices, data, decay, psi, log_psi, mean_psi, mean_log_psi, tolerance, epsilon, max_epochs):
     """Lines 2-3 until the relative change between epochs is below ``tolerance``; tables change in place.
 
@@ -103,13 +104,13 @@ def psi_phase(indptr, indices, data, decay, psi, log_psi, mean_psi, mean_log_psi
 # ---------------------------------------------------------------------------------------------------
 
 
-@numba.njit(cache=True, fastmath={"contract"})
+@numba.njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _u_chunk(pair, pair_next, factor, noisy, g, z, inv_rho, lr_u, lr_rho, inv_rho_min, new, begin, end):
     """Tuples begin..end of lines 9-11. z changes in place; returns 1/rho.
 
     With q = 1/rho and w = g * z(s',a'), line 10 is z' = (1-lr_u) z + lr_u w q, and line 11,
     rho' = (1-lr_rho) rho + lr_rho w / z', becomes q' = q z' / ((1-lr_rho) z' + lr_rho w q). Written in
-    the old z, numerator and denominator are ready while the division runs.
+    the old z, numerator and denominator are ready together: a chain of multiply-add, divide, multiply.
     """
     keep = 1.0 - lr_u
     keep_rho = 1.0 - lr_rho
@@ -130,13 +131,13 @@ def _u_chunk(pair, pair_next, factor, noisy, g, z, inv_rho, lr_u, lr_rho, inv_rh
         den_kept = keep_rho if same else keep_rho * kept
         den_w = lr_rho * gain if same else both * w
         num = 1.0 if same else z_new
-        q = (q / (den_kept + den_w * q)) * num
+        q *= num / (den_kept + den_w * q)
         if q < inv_rho_min:  # not max(): NaN must stay visible
             q = inv_rho_min
     return q
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _is_healthy(z, q):
     if not (np.isfinite(q) and q > 0.0):
         return False
@@ -146,7 +147,7 @@ def _is_healthy(z, q):
     return True
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def u_epoch(
     pair, pair_next, factor, noisy, g, z, inv_rho, lr_u, lr_rho, inv_rho_min, new, rescale_every, begin, end
 ):
@@ -189,7 +190,7 @@ def u_epoch(
 # ---------------------------------------------------------------------------------------------------
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def cumulative_rows(indptr, data):
     """Running sums within each CSR row; 1 from the last positive entry on, so that rounding can neither
     leave the row nor reach an entry of probability 0."""
@@ -206,7 +207,7 @@ def cumulative_rows(indptr, data):
     return cdf
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _draw(cdf, low, high, x):
     """First index m in [low, high) with x < cdf[m], by bisection."""
     high -= 1
@@ -219,7 +220,7 @@ def _draw(cdf, low, high, x):
     return low
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def simulate(
     indptr,
     indices,
@@ -267,7 +268,7 @@ def simulate(
             a = _draw(behaviour_cdf, first, first + n_actions, behaviour_rng.random()) - first
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def simulate_returns(indptr, indices, cdf, reward, start_cdf, policy_cdf, episode_length, rng, returns):
     """Undiscounted return of ``returns.size`` episodes under a policy (cdf flat [S*A]); fills ``returns``."""
     n_actions = reward.shape[1]
@@ -281,7 +282,7 @@ def simulate_returns(indptr, indices, cdf, reward, start_cdf, policy_cdf, episod
         returns[episode] = total
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def finite_horizon_return(indptr, indices, data, reward, start, horizon):
     """Expected undiscounted sum of ``reward`` [S] over ``horizon`` steps of a chain (CSR [S, S])."""
     now = start.copy()

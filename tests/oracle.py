@@ -1,0 +1,41 @@
+"""Dense oracle for tiny MDPs, written from the paper's equations with numpy.linalg.eig; shares no code."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+
+class Iterate(NamedTuple):
+    """One exact biasing iteration: biases from psi, then the dominant eigenpair under them."""
+
+    psi: np.ndarray  # [S], behind the biases
+    mean_psi: np.ndarray  # [S, A]
+    mean_log_psi: np.ndarray  # [S, A]
+    delta: np.ndarray  # [S, A]
+    rho: float
+    u: np.ndarray  # [S, A]
+    policy: np.ndarray  # [S, A]
+    theta: float
+
+
+def biasing_iterations(p, r, prior, beta, n):
+    """The first ``n`` exact biasing iterations. p [S, A, S], r and prior [S, A]."""
+    n_states, n_actions, _ = p.shape
+    psi = np.ones(n_states)
+    iterates = []
+    for _ in range(n):
+        mean_psi, mean_log_psi = p @ psi, p @ np.log(psi)
+        delta = (np.log(mean_psi) - mean_log_psi) / beta  # eq. (9)
+        b = psi / mean_psi[..., None]  # eq. (8), [S, A, S]
+        weight = np.exp(beta * (r + delta - delta.max()))
+        # eq. (4): sum over (s', a') of exp(beta r_b) p b pi0(a'|s') u(s', a') = rho u(s, a)
+        tilted = np.einsum("sa,sat,sat,tb->satb", weight, p, b, prior)
+        values, vectors = np.linalg.eig(tilted.reshape(n_states * n_actions, -1))
+        top = np.argmax(values.real)
+        u = np.abs(vectors[:, top].real).reshape(n_states, n_actions)
+        rho = float(values[top].real)
+        policy = prior * u / (prior * u).sum(1, keepdims=True)
+        theta = -np.log(rho) / beta - delta.max()
+        iterates.append(Iterate(psi, mean_psi, mean_log_psi, delta, rho, u, policy, theta))
+        psi = 1 / (prior * u).sum(1)  # eq. (7)
+    return iterates
