@@ -7,6 +7,7 @@ python train.py -m learner.beta=2,5,10 seed=0,1        one run a combination
 tensorboard --logdir runs                              look at the runs
 """
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +21,11 @@ config.register()
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="train")
 @cli.job
-def main(cfg: DictConfig, directory: Path) -> Any:
+def main(cfg: DictConfig, directory: Path, safe_point: Callable[[], None]) -> Any:
     # Imported here: torch takes seconds, and --help and Tab completion do not need it.
     from erl_torch.training import train
 
-    return train(cfg, directory)["objective"]
+    return train(cfg, directory, safe_point)["objective"]
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ import re
 import shutil
 import signal
 import sys
+import threading
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -28,9 +29,39 @@ BY_CONFIGURATION = (HydraException, OmegaConfBaseException)
 OPEN_NODES = ("env.kwargs.",)  # keys of the user's own: no schema lists them
 
 
-def job(work: Callable[[DictConfig, Path], Any]) -> Callable[[DictConfig], Any]:
-    """A Hydra task out of ``work(cfg, run_directory)``.
+class Signals:
+    """SIGINT and SIGTERM wait for a safe point: an exception out of a signal handler that happens to run
+    inside the compiler or a compiled loop is lost there, or crashes the process. A second signal is not
+    held back."""
 
+    def __init__(self) -> None:
+        self.received: int | None = None
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> Signals:
+        if threading.current_thread() is threading.main_thread():
+            self._before = {n: signal.signal(n, self._note) for n in (signal.SIGINT, signal.SIGTERM)}
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def safe_point(self) -> None:
+        """Raise SystemExit(128 + signal) if one has come."""
+        if self.received is not None:
+            raise SystemExit(128 + self.received)
+
+    def _note(self, number: int, frame: Any) -> None:
+        self.received = number
+        signal.signal(number, signal.SIG_DFL)
+        print("\nstopping after this epoch; what is learnt will be saved", file=sys.stderr)
+
+
+def job(work: Callable[[DictConfig, Path, Callable[[], None]], Any]) -> Callable[[DictConfig], Any]:
+    """A Hydra task out of ``work(cfg, run_directory, safe_point)``.
+
+    ``safe_point`` is to be called where the work may be ended: it raises SystemExit after a signal.
     Bad input ends a single run with one line and exit code 1, and fails that job alone in a multirun;
     a run directory in which nothing was written goes again.
     """
@@ -40,7 +71,8 @@ def job(work: Callable[[DictConfig, Path], Any]) -> Callable[[DictConfig], Any]:
         hydra = HydraConfig.get()
         directory = Path(hydra.runtime.output_dir)
         try:
-            return work(cfg, directory)
+            with Signals() as signals:
+                return work(cfg, directory, signals.safe_point)
         except Exception as error:
             if not isinstance(error, BY_RUN):
                 raise
@@ -67,7 +99,6 @@ def run(main: Callable[[], Any], about: str, conf: Path, config_name: str) -> No
 
     With HYDRA_FULL_ERROR=1 in the environment every traceback is shown.
     """
-    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     arguments = sys.argv[1:]
     # Keys that no schema lists need Hydra's "++"; the user need not know.
     arguments = [f"++{a}" if a.startswith(OPEN_NODES) else a for a in arguments]
@@ -81,7 +112,6 @@ def run(main: Callable[[], Any], about: str, conf: Path, config_name: str) -> No
             return
         main()
     except KeyboardInterrupt:
-        print("stopped by Ctrl-C; what was logged is on disk", file=sys.stderr)
         raise SystemExit(130) from None
     except Exception as error:
         if isinstance(error, BY_CONFIGURATION) and not full:

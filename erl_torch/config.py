@@ -100,7 +100,7 @@ SCHEMAS: dict[str, dict[str, type]] = {
 
 def slug(text: Any) -> str:
     """``text`` as part of a file name: no separators, nothing a shell would touch."""
-    return re.sub(r"[^A-Za-z0-9_.=+-]+", "-", str(text)).strip("-.") or "run"
+    return re.sub(r"[^A-Za-z0-9_.=+]+", "-", str(text)).strip("-.") or "run"
 
 
 def run_name(number: int, overrides: str) -> str:

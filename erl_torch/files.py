@@ -60,12 +60,9 @@ def read_npz(path: str | os.PathLike[str], key: str = "path") -> dict[str, np.nd
     Raises InputError (under ``key``) if the file is missing, damaged, or holds objects.
     """
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise InputError(key, path, "an npz file")
+        # Opened here: np.load leaves the file open when it meets a damaged one.
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
-    except InputError:
-        raise
     except Exception as error:
         # np.load answers damage with a dozen kinds of exception, zlib's and struct's among them.
         raise InputError(key, path, f"a readable npz file without pickled objects ({error})") from error
@@ -74,7 +71,8 @@ def read_npz(path: str | os.PathLike[str], key: str = "path") -> dict[str, np.nd
 def read_npy(path: str | os.PathLike[str], key: str = "path") -> np.ndarray:
     """One array from an npy file, without pickle. Raises InputError under ``key``."""
     try:
-        array = np.load(path, allow_pickle=False)
+        with open(path, "rb") as file:
+            array = np.load(file, allow_pickle=False)
     except Exception as error:
         raise InputError(key, path, f"a readable npy file without pickled objects ({error})") from error
     if not isinstance(array, np.ndarray):

@@ -10,9 +10,16 @@ Pair index: ``k = s * n_actions + a``. Transition matrices come as CSR arrays (i
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numba
 import numpy as np
+
+
+def compiled_before() -> bool:
+    """Whether an earlier run on this machine has left compiled loops behind."""
+    return any(Path(u_epoch.stats.cache_path).glob("kernels.u_epoch*.nbi"))
+
 
 # ---------------------------------------------------------------------------------------------------
 # Algorithm S1, lines 2-3: one epoch of the psi phase is the affine map x <- decay * x + W psi

@@ -43,10 +43,11 @@ def policy_picture(
     free = np.flatnonzero(~np.isin(grid.tiles, ["H", "G", "W"]))
     row, col = np.divmod(free, grid.shape[1])
     for move, probability in zip(MOVES, policy[free].T, strict=True):
-        dy, dx = move[:, None] * 0.46 * probability
+        shown = probability > 0.02
+        dy, dx = move[:, None] * 0.46 * probability[shown]
         axes.quiver(
-            col, row, dx, dy, angles="xy", scale_units="xy", units="xy", scale=1, color=ARROW, width=0.06,
-            headwidth=3.5, headlength=3.5, headaxislength=3, minlength=0.2, zorder=3,
+            col[shown], row[shown], dx, dy, angles="xy", scale_units="xy", units="xy", scale=1, color=ARROW,
+            width=0.06, headwidth=3.5, headlength=3.5, headaxislength=3, minlength=0.2, zorder=3,
         )  # fmt: skip
     return _pixels(figure)
 

@@ -9,7 +9,7 @@ import contextlib
 import platform
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 import erl_torch
-from erl_torch import checks, pictures
+from erl_torch import checks, kernels, pictures
 from erl_torch.board import Board
 from erl_torch.checks import InputError
 from erl_torch.config import check_keys
@@ -31,13 +31,16 @@ from erl_torch.experience import collect, sizes
 from erl_torch.files import read_npy, write_json
 from erl_torch.learners import LEARNERS, NonFiniteError, S1State
 from erl_torch.mdp import check_policy
-from erl_torch.rng import streams
+from erl_torch.rng import Streams, streams
 from erl_torch.solution import Solution, Status
 from erl_torch.transitions import Transitions
 
 
-def train(cfg: DictConfig, directory: Path) -> dict[str, Any]:
+def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lambda: None) -> dict[str, Any]:
     """Run ``cfg`` (as composed from ``conf/``) in ``directory``; returns what ``result.json`` holds.
+
+    ``safe_point`` is called between blocks of work; it may raise SystemExit or KeyboardInterrupt, which goes
+    on to the caller once everything learnt has been written.
 
     Raises:
         InputError: a key or value that cannot be used, before anything is learnt or written.
@@ -49,6 +52,8 @@ def train(cfg: DictConfig, directory: Path) -> dict[str, Any]:
     checks.at_least("seed", cfg.seed, 0)
     checks.at_least("threads", cfg.threads, 1)
     torch.set_num_threads(cfg.threads)
+    if not kernels.compiled_before():
+        print("compiling the loops, about ten seconds: on the first run only", file=sys.stderr)
     rng = streams(cfg.seed)
     _check_evaluation(cfg.evaluation)
     env = _make_env(cfg.env)
@@ -56,7 +61,8 @@ def train(cfg: DictConfig, directory: Path) -> dict[str, Any]:
         n_states, n_actions = sizes(env)
         learner = _make_learner(cfg.learner, n_states, n_actions)
         prior = check_policy("learner.prior_policy", learner.prior_policy, n_states, n_actions)
-        data = _experience(cfg.experience, env, n_states, n_actions, rng, prior)
+        data = _experience(cfg.experience, env, n_states, n_actions, rng, prior, safe_point)
+        safe_point()
 
         def measure(policy: torch.Tensor) -> Evaluation:
             e = cfg.evaluation
@@ -87,6 +93,7 @@ def train(cfg: DictConfig, directory: Path) -> dict[str, Any]:
                             drawer.policy(state, f"policy, biasing iteration {state.bias_iteration}")
                             drawer.bias(state)
                         progress.advance(state, last, ends_phase)
+                        safe_point()
             except (NonFiniteError, KeyboardInterrupt, SystemExit) as error:
                 stopped = error
             failure = stopped if isinstance(stopped, NonFiniteError) else None
@@ -159,7 +166,13 @@ def _make_learner(cfg: DictConfig, n_states: int, n_actions: int) -> Any:
 
 
 def _experience(
-    cfg: DictConfig, env: gym.Env[Any, Any], n_states: int, n_actions: int, rng: Any, prior: np.ndarray
+    cfg: DictConfig,
+    env: gym.Env[Any, Any],
+    n_states: int,
+    n_actions: int,
+    rng: Streams,
+    prior: np.ndarray,
+    safe_point: Callable[[], None],
 ) -> Transitions:
     with _group("experience"):
         if cfg.name == "recorded":
@@ -176,15 +189,12 @@ def _experience(
             total=cfg.n_episodes * cfg.episode_length if cfg.n_episodes >= 1 and cfg.episode_length >= 1 else 0,
             desc="collecting", unit=" tuples", unit_scale=True, delay=1, leave=False, disable=None,
         ) as bar:  # fmt: skip
-            data = collect(
-                env,
-                cfg.n_episodes,
-                cfg.episode_length,
-                rng,
-                behaviour,
-                prior,
-                report=lambda n: bar.update(n - bar.n),
-            )
+
+            def report(n: int) -> None:
+                bar.update(n - bar.n)
+                safe_point()
+
+            data = collect(env, cfg.n_episodes, cfg.episode_length, rng, behaviour, prior, report)
         if cfg.save_to is not None:
             data.save(cfg.save_to)
         return data

@@ -5,12 +5,12 @@ from dataclasses import replace
 
 import hypothesis
 import numpy as np
+import oracle
 import pytest
 import torch
+from conftest import problems, random_mdp, random_policy, random_stream
 from hypothesis import strategies as st
 
-import oracle
-from conftest import problems, random_mdp, random_policy, random_stream
 from erl_torch import AlgorithmS1, InputError, NonFiniteError, Solution, Status, Transitions, collect, kernels
 from erl_torch.envs.windy_cliff import WindyCliffEnv
 
@@ -19,7 +19,7 @@ IMPLEMENTATIONS = ("fast", "literal")
 
 def all_tuples(mdp):
     """One tuple of every (s, a, s', a') with p > 0."""
-    n_states, n_actions = mdp.reward.shape
+    n_actions = mdp.n_actions
     pairs, s_next = mdp.transition.nonzero()
     s, a = np.divmod(np.repeat(pairs, n_actions), n_actions)
     a_next = np.tile(np.arange(n_actions), len(pairs))
@@ -205,9 +205,7 @@ def test_converges_to_the_exact_biasing_iterations(seed):
     mdp, prior = random_mdp(rng, 3, 2), random_policy(rng, 3, 2)
     data = collect(mdp, 1, 100_000, seed, prior_policy=prior)
     learner = AlgorithmS1(beta=2.0, lr_u=0.002, lr_psi=0.002, n_epochs=8, n_bias=4, prior_policy=prior)
-    exact = oracle.biasing_iterations(
-        mdp.transition.toarray().reshape(3, 2, 3), mdp.reward, prior, 2.0, 4
-    )
+    exact = oracle.biasing_iterations(mdp.transition.toarray().reshape(3, 2, 3), mdp.reward, prior, 2.0, 4)
     for state in learner.iterate(data, 3, 2):
         if state.epoch == learner.n_epochs:
             iterate = exact[state.bias_iteration]

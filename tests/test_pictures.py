@@ -1,0 +1,66 @@
+"""Pictures: sizes that fit TensorBoard's cards, and contents that follow the data."""
+
+import numpy as np
+import pytest
+
+from erl_torch import pictures
+from erl_torch.envs.grid_world import GridWorld, uniform_wind
+from erl_torch.envs.windy_cliff import WindyCliffEnv
+
+GRID = WindyCliffEnv().grid
+LARGE = GridWorld(("S" + "F" * 29,) + ("F" * 30,) * 29, uniform_wind(("F" * 30,) * 30, 1.0, 0.5))
+
+
+@pytest.mark.parametrize("grid", [GRID, LARGE, None], ids=["cliff", "30x30", "table"])
+@pytest.mark.parametrize("draw", [pictures.policy_picture, pictures.bias_picture])
+def test_size_and_type(draw, grid):
+    n_states = 15 if grid is None else grid.tiles.size
+    picture = draw(np.full((n_states, 4), 0.25), grid, "title")
+    assert picture.dtype == np.uint8
+    assert picture.shape[2] == 3
+    assert max(picture.shape[:2]) <= pictures.MAX_PX + 1
+    assert picture.std() > 5  # not blank
+
+
+def blue(picture):
+    r, g, b = np.moveaxis(picture.astype(int), -1, 0)
+    return (b - r > 60) & (g < 120)
+
+
+def test_arrows_point_where_the_policy_goes():
+    """All on one action in the middle tile: the arrow's pixels lie on that side of the tile's centre."""
+    grid = GridWorld(("RRR", "RRR", "SRR"))
+    for action, (axis, sign) in enumerate([(1, -1), (0, 1), (1, 1), (0, -1)]):
+        policy = np.zeros((9, 4))
+        policy[4, action] = 1
+        pixels = np.argwhere(blue(pictures.policy_picture(policy, grid)))
+        height, width = pictures.policy_picture(policy, grid).shape[:2]
+        px = (height - 30) / 3
+        centre = np.array([24 + 1.5 * px, 6 + 1.5 * px])
+        assert width >= height - 24
+        offset = pixels.mean(0) - centre
+        assert sign * offset[axis] > 0.1 * px
+        assert abs(offset[1 - axis]) < 0.05 * px
+
+
+def test_traps_and_goal_have_no_arrows():
+    grid = GridWorld(("HG", "SR"))
+    assert not blue(pictures.policy_picture(np.vstack([np.full((2, 4), 0.25), np.zeros((2, 4))]), grid)).any()
+
+
+def test_bias_colours_follow_the_values():
+    flat, peaked = np.zeros((15, 4)), np.zeros((15, 4))
+    peaked[7, 2] = 1.0
+    change = np.argwhere((pictures.bias_picture(flat, GRID) != pictures.bias_picture(peaked, GRID)).any(-1))
+    grid_part = change[change[:, 1] < 200]
+    px = (400 - 30) / 5
+    centre = 24 + 2.5 * px, 6 + 1.5 * px  # state 7: row 2, col 1
+    assert (np.abs(grid_part - centre) < px / 2 + 2).all()
+    assert grid_part[:, 1].mean() > centre[1]  # action 2 points right
+
+
+def test_agent_is_drawn_where_it_stands():
+    board = pictures.board(GRID)
+    for cell in [(0, 0), (4, 1)]:
+        change = np.argwhere((pictures.with_agent(board, GRID.shape, cell) != board).any(-1))
+        np.testing.assert_allclose(change.mean(0), (np.array(cell) + 0.5) * 64 - 0.5, atol=1)

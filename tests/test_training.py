@@ -1,0 +1,232 @@
+"""Whole runs: what a run directory holds, what is logged, and that bits repeat."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from test_config import composed
+
+from erl_torch import Solution, Status, Transitions
+from erl_torch.training import train
+
+ROOT = Path(__file__).parents[1]
+SMALL = ("experience.n_episodes=20", "learner.n_epochs=2", "learner.n_bias=3")
+
+
+def run(*arguments, cwd, **options):
+    return subprocess.run(
+        [sys.executable, str(ROOT / "train.py"), *arguments],
+        cwd=cwd, capture_output=True, text=True, timeout=120, **options,
+    )  # fmt: skip
+
+
+def events(directory):
+    reader = EventAccumulator(str(directory), size_guidance={"images": 0, "scalars": 0, "tensors": 0})
+    return reader.Reload()
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    directory = tmp_path_factory.mktemp("run")
+    result = train(composed(*SMALL), directory)
+    return directory, result
+
+
+def test_run_directory(finished):
+    directory, result = finished
+    names = sorted(p.name for p in directory.iterdir())
+    assert names[0].startswith("events.out.tfevents")
+    assert names[1:] == ["result.json", "solution.npz"]
+    assert json.loads((directory / "result.json").read_text()) == result
+    assert result["status"] == "completed"
+    assert result["n_experience"] == 20_000
+    assert result["n_tuples"] == 120_000
+    solution = Solution.load(directory / "solution.npz")
+    assert solution.theta == result["theta"]
+    assert solution.theta == pytest.approx(-np.log(solution.rho) / 10 - solution.reward_bias_max, rel=1e-14)
+    assert {"erl_torch", "python", "torch", "numpy", "gymnasium"} == set(result["versions"])
+
+
+def test_scalars(finished):
+    directory, result = finished
+    reader = events(directory)
+    steps = [0, *range(20_000, 120_001, 20_000)]
+    documented = {
+        f"s1/{name}"
+        for name in ("rho", "theta", "delta_max", "delta_mean", "psi_error", "psi_epochs", "bias_iteration")
+    } | {"eval/return", "eval/reward_per_step", "eval/objective"}
+    assert set(reader.Tags()["scalars"]) == documented | {"time/tuples_per_second"}
+    values = {}
+    for tag in documented:
+        assert [e.step for e in reader.Scalars(tag)] == steps, tag
+        values[tag] = [e.value for e in reader.Scalars(tag)]
+        assert np.isfinite(values[tag]).all()
+    assert values["eval/reward_per_step"][0] == pytest.approx(-1.6263453, abs=1e-6)  # the prior policy
+    assert values["s1/theta"][0] == pytest.approx(1.0)
+    assert values["s1/rho"][0] == pytest.approx(np.exp(-10))
+    assert values["s1/bias_iteration"] == [0, 0, 0, 1, 1, 2, 2]
+    for tag, key in [("s1/theta", "theta"), ("eval/objective", "objective"), ("eval/return", "return")]:
+        assert values[tag][-1] == pytest.approx(result[key], rel=1e-6)
+    history = Solution.load(directory / "solution.npz").history
+    np.testing.assert_allclose(values["s1/delta_max"][1:], history["delta_max"], rtol=1e-6)
+
+
+def test_every_tag_is_documented(finished):
+    text = (ROOT / "docs" / "logging.md").read_text()
+    tags = events(finished[0]).Tags()
+    for tag in [*tags["scalars"], *tags["images"]]:
+        assert f"`{tag}`" in text, tag
+
+
+def test_pictures_text_and_boards(finished):
+    reader = events(finished[0])
+    assert [e.step for e in reader.Images("policy")] == [0, 40_000, 80_000, 120_000]
+    assert [e.step for e in reader.Images("reward_bias")] == [40_000, 80_000, 120_000]
+    assert all(max(e.width, e.height) <= 401 for e in reader.Images("policy"))
+    plugins = reader.summary_metadata
+    assert "configuration/text_summary" in plugins
+    assert plugins["custom_scalars__config__"].plugin_data.plugin_name == "custom_scalars"
+    hparams = [tag for tag, meta in plugins.items() if meta.plugin_data.plugin_name == "hparams"]
+    assert sorted(hparams) == ["_hparams_/session_end_info", "_hparams_/session_start_info"]
+
+
+def bits(tmp_path, name, *overrides):
+    train(composed(*SMALL, "evaluation.pictures=false", *overrides), tmp_path / name)
+    return (tmp_path / name / "solution.npz").read_bytes()
+
+
+def test_same_seed_same_bits(tmp_path):
+    first = bits(tmp_path, "a")
+    assert bits(tmp_path, "b") == first
+    try:
+        assert bits(tmp_path, "c", "threads=2") == first
+    finally:
+        torch.set_num_threads(1)
+    assert bits(tmp_path, "d", "seed=1") != first
+    # Evaluation draws from a stream of its own.
+    assert bits(tmp_path, "e", "evaluation.n_episodes=3", "evaluation.every=2") == first
+
+
+def test_recorded_experience_is_the_simulated_one(tmp_path):
+    first = bits(tmp_path, "a", f"experience.save_to={tmp_path}/tuples.npz")
+    assert len(Transitions.load(tmp_path / "tuples.npz")) == 20_000
+    overrides = (*SMALL[1:], "evaluation.pictures=false", "experience=recorded")
+    train(composed(*overrides, f"experience.path={tmp_path}/tuples.npz"), tmp_path / "b")
+    assert (tmp_path / "b" / "solution.npz").read_bytes() == first
+
+
+def test_environment_without_a_model(tmp_path):
+    result = train(
+        composed(
+            "env=gym", "env.id=FrozenLake-v1", "++env.kwargs.is_slippery=false", "learner.beta=5",
+            "experience.n_episodes=3000", "experience.episode_length=100", "learner.unvisited=prior",
+            "learner.lr_u=0.05", "evaluation.horizon=100", "evaluation.every=15",
+        ),
+        tmp_path,
+    )  # fmt: skip
+    first = events(tmp_path).Scalars("eval/reward_per_step")[0].value
+    assert result["status"] == "completed"
+    assert result["reward_per_step"] > 5 * max(first, 0.001)
+    assert events(tmp_path).Images("policy")[-1].height == 400
+
+
+def test_failure_keeps_what_was_learnt(tmp_path):
+    """exp(-5 beta) underflows at beta 300: the run stops with step and cause, and its files stand."""
+    from erl_torch import NonFiniteError
+
+    with pytest.raises(NonFiniteError, match=r"^step \d+: .*beta"):
+        train(composed(*SMALL, "learner.beta=300", "learner.lr_u=0.9"), tmp_path)
+    result = json.loads((tmp_path / "result.json").read_text())
+    assert result["status"] == "non_finite"
+    assert result["message"].startswith("step ")
+    assert Solution.load(tmp_path / "solution.npz").status is Status.NON_FINITE
+    assert len(events(tmp_path).Scalars("eval/objective")) >= 1
+
+
+# -- the command line, as typed ---------------------------------------------------------------------------
+
+
+def test_command_line_run(tmp_path):
+    done = run("env=windy_cliff", *SMALL, "evaluation.pictures=false", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    (directory,) = (tmp_path / "runs" / "windy_cliff").iterdir()
+    assert {".hydra", "result.json", "solution.npz"} < {p.name for p in directory.iterdir()}
+    assert f"runs/windy_cliff/{directory.name}" in done.stdout
+    assert "tensorboard --logdir runs" in done.stdout
+    # In a pipe: a line a biasing iteration, and no bar.
+    lines = done.stderr.splitlines()
+    assert [line.split(":")[0] for line in lines] == [f"biasing iteration {k}" for k in range(3)]
+    assert "\r" not in done.stderr
+
+
+def test_command_line_errors(tmp_path):
+    for arguments, code, start in [
+        (["learner.beta=-1"], 1, "error: learner.beta=-1.0: must be a finite number > 0"),
+        (["+learner.betta=2"], 1, "error: learner.betta=2: must be left out: no such key; there are"),
+        (["learner.beta=two"], 1, "error: learner.beta=two: Value 'two'"),
+        (["beta"], 2, "error: beta: not of the form key=value"),
+    ]:
+        done = run(*arguments, cwd=tmp_path)
+        assert done.returncode == code
+        assert done.stderr.startswith(start)
+        assert done.stderr.count("\n") == 1
+        assert done.stdout == ""
+    assert not list((tmp_path / "runs").iterdir())
+
+
+def test_help_is_complete_and_needs_no_torch(tmp_path):
+    done = run("--help", cwd=tmp_path, env={**os.environ, "PYTHONPROFILEIMPORTTIME": "1"})
+    assert done.returncode == 0
+    for text in ("python train.py env=windy_cliff", "env={gym,windy_cliff}", "lr_psi: 0.1", "conf/"):
+        assert text in done.stdout
+    assert " gymnasium\n" in done.stderr
+    for module in (" torch\n", " numba\n", " scipy\n", " matplotlib\n"):
+        assert module not in done.stderr
+    assert not (tmp_path / "runs").exists()
+
+
+def test_multirun_writes_one_named_directory_a_job(tmp_path):
+    """The job that cannot run says so and leaves nothing; the others finish."""
+    done = run("-m", "learner.beta=2,-1,5", "seed=0,1", *SMALL, "evaluation.pictures=false", cwd=tmp_path)
+    assert done.returncode == 1
+    (sweep,) = (tmp_path / "runs" / "windy_cliff").iterdir()
+    assert sweep.name.startswith("sweep-")
+    names = [p.name.split("-pictures")[0] for p in sorted(sweep.iterdir()) if p.is_dir()]
+    assert [n[:3] for n in names] == ["000", "001", "004", "005"]
+    for directory in sweep.iterdir():
+        if directory.is_dir():
+            result = json.loads((directory / "result.json").read_text())
+            assert f"beta={result['beta']:g}-" in directory.name
+            assert directory.name.endswith(f"-seed={result['seed']}")
+    assert done.stderr.count("learner.beta=-1.0: must be a finite number > 0") == 2
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_termination_keeps_what_was_learnt(tmp_path, number):
+    process = subprocess.Popen(
+        [sys.executable, str(ROOT / "train.py"), "learner.n_epochs=100000", "evaluation.pictures=false"],
+        cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline and not list(tmp_path.rglob("events.*")):
+        time.sleep(0.1)
+    time.sleep(1.5)
+    process.send_signal(number)
+    out, _ = process.communicate(timeout=60)
+    assert process.returncode == 128 + number
+    assert "stopped by the caller" in out
+    (directory,) = (tmp_path / "runs" / "windy_cliff").iterdir()
+    result = json.loads((directory / "result.json").read_text())
+    assert result["status"] == "stopped"
+    assert result["n_tuples"] > 0
+    logged = events(directory).Scalars("s1/theta")
+    assert logged[-1].step == result["n_tuples"]
+    assert logged[-1].value == pytest.approx(result["theta"], rel=1e-6)

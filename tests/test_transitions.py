@@ -1,0 +1,90 @@
+"""Transitions: validation, and files that never carry pickles or half a write."""
+
+import numpy as np
+import pytest
+import torch
+
+from erl_torch import InputError, Transitions
+
+COLUMNS = {
+    "s": [0, 1, 2],
+    "a": [1, 0, 1],
+    "r": [-1.0, 0.5, 0.0],
+    "s_next": [1, 2, 0],
+    "a_next": [0, 1, 1],
+}
+
+
+def test_dtypes_and_tensors():
+    data = Transitions(**{name: torch.tensor(values) for name, values in COLUMNS.items()})
+    assert [getattr(data, n).dtype for n in COLUMNS] == [np.int32, np.int32, np.float64, np.int32, np.int32]
+    assert len(data) == 3
+
+
+def test_round_trip_is_exact_and_repeatable(tmp_path):
+    data = Transitions(**COLUMNS)
+    first, second = data.save(tmp_path / "a.npz"), data.save(tmp_path / "deep" / "b.npz")
+    assert first.read_bytes() == second.read_bytes()
+    loaded = Transitions.load(first)
+    for name in COLUMNS:
+        assert np.array_equal(getattr(loaded, name), getattr(data, name))
+    assert sorted(p.name for p in tmp_path.rglob("*")) == ["a.npz", "b.npz", "deep"]
+
+
+def test_loads_any_npz_with_the_columns(authors, authors_tuples):
+    from conftest import DATA
+
+    loaded = Transitions.load(DATA / "windy_cliff_s1.npz")
+    assert np.array_equal(loaded.s_next, authors_tuples.s_next)
+    assert len(loaded) == 20_000
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"s": [0, -1, 2]}, r"s\[1\]=-1: must be a whole number"),
+        ({"s": [0, 2**31, 2]}, r"s\[1\]=2147483648"),
+        ({"a": [0.5, 1.0, 0.0]}, r"a=dtype float64: must be an array of whole numbers"),
+        ({"r": [0.0, np.nan, 0.0]}, r"r\[1\]=nan: must be finite"),
+        ({"r": ["a", "b", "c"]}, r"r=dtype <U1: must be an array of numbers"),
+        ({"s_next": [0, 1]}, r"columns=lengths .*'s_next': 2.*: must be of one length"),
+        ({"a_next": [[0, 1, 2]]}, r"a_next=array of shape \(1, 3\): must be one-dimensional"),
+        ({name: [] for name in COLUMNS}, r"transitions=0 tuples: must be at least one tuple"),
+    ],
+)
+def test_refuses(change, message):
+    with pytest.raises(InputError, match=message):
+        Transitions(**(COLUMNS | change))
+
+
+def test_bad_files_are_named(tmp_path):
+    good = Transitions(**COLUMNS).save(tmp_path / "good.npz")
+    whole = good.read_bytes()
+    cases = {
+        "missing.npz": None,
+        "empty.npz": b"",
+        "text.npz": b"hello",
+        "cut.npz": whole[: len(whole) // 2],
+        "flipped.npz": whole[:60] + bytes([whole[60] ^ 255]) + whole[61:],
+    }
+    for name, content in cases.items():
+        if content is not None:
+            (tmp_path / name).write_bytes(content)
+        with pytest.raises(InputError, match=name) as error:
+            Transitions.load(tmp_path / name)
+        assert "\n" not in str(error.value)
+
+
+def test_pickles_are_refused(tmp_path):
+    np.savez(tmp_path / "p.npz", **{n: np.array(v, dtype=object) for n, v in COLUMNS.items()})
+    with pytest.raises(InputError, match=r"p\.npz.*without pickled objects"):
+        Transitions.load(tmp_path / "p.npz")
+
+
+def test_missing_column_and_bad_row_name_the_file(tmp_path):
+    np.savez(tmp_path / "few.npz", s=[0])
+    with pytest.raises(InputError, match=r"few\.npz: must be .* it lacks a"):
+        Transitions.load(tmp_path / "few.npz")
+    np.savez(tmp_path / "nan.npz", **(COLUMNS | {"r": [0.0, 0.0, np.inf]}))
+    with pytest.raises(InputError, match=r"nan\.npz: r\[2\]=inf"):
+        Transitions.load(tmp_path / "nan.npz")
