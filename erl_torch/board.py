@@ -12,8 +12,8 @@ from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
 
 LAYOUT = {
-    "Convergence": {
-        "rho and theta": ["Multiline", ["s1/rho", "s1/theta"]],
+    "rho and theta": {
+        "rho": ["Multiline", ["s1/rho"]],
         "theta": ["Multiline", ["s1/theta"]],
         "biasing": ["Multiline", ["s1/bias_iteration", "s1/psi_epochs"]],
         "psi error": ["Multiline", ["s1/psi_error"]],
