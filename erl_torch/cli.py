@@ -26,6 +26,7 @@ from erl_torch.checks import InputError
 
 BY_RUN = (InputError, ArithmeticError, OSError)
 BY_CONFIGURATION = (HydraException, OmegaConfBaseException)
+REPORTED = "reported by its job"
 OPEN_NODES = ("env.kwargs.",)  # keys of the user's own: no schema lists them
 
 
@@ -83,6 +84,7 @@ def job(work: Callable[[DictConfig, Path, Callable[[], None]], Any]) -> Callable
             if hydra.mode != RunMode.MULTIRUN:
                 raise SystemExit(_report(error)) from error
             print(f"error: job {hydra.job.num} ({hydra.job.override_dirname}): {_line(error)}", file=sys.stderr)
+            error.add_note(REPORTED)
             raise
 
     return task
@@ -114,11 +116,10 @@ def run(main: Callable[[], Any], about: str, conf: Path, config_name: str) -> No
     except KeyboardInterrupt:
         raise SystemExit(130) from None
     except Exception as error:
-        if isinstance(error, BY_CONFIGURATION) and not full:
-            raise SystemExit(_report(error)) from None
-        if isinstance(error, BY_RUN) and not full:
-            raise SystemExit(1) from None  # a job of a multirun, which has said its own line
-        raise
+        if full or not isinstance(error, BY_CONFIGURATION + BY_RUN):
+            raise
+        said = REPORTED in getattr(error, "__notes__", ())
+        raise SystemExit(1 if said else _report(error)) from None
 
 
 def _help(about: str, conf: Path, config_name: str, overrides: list[str]) -> str:

@@ -302,6 +302,7 @@ def _summary(
 ) -> str:
     with contextlib.suppress(ValueError):
         directory = directory.resolve().relative_to(Path.cwd())
+    logs = "runs" if directory.parts[0] == "runs" else directory
     rate = result["n_tuples"] / max(result["seconds_learning"], 1e-3) / 1e6
     rows = [
         ("theta", f"{start.theta:12.5f}", f"{result['theta']:12.5f}"),
@@ -318,7 +319,7 @@ def _summary(
         f"{'tuples streamed':18}{result['n_tuples']:,} (of {result['n_experience']:,}; {rate:.3g} M/s)",
         f"{'seconds':18}{result['seconds']:.1f}, of which {result['seconds_learning']:.1f} learning",
         f"{'run directory':18}{directory}",
-        f"{'look at it':18}tensorboard --logdir runs",
+        f"{'look at it':18}tensorboard --logdir {logs}",
     ]
     if result["status"] != "completed":
         lines.append(f"{'status':18}{Status[result['status'].upper()].value}")

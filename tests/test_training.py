@@ -173,6 +173,7 @@ def test_command_line_errors(tmp_path):
         (["+learner.betta=2"], 1, "error: learner.betta=2: must be left out: no such key; there are"),
         (["learner.beta=two"], 1, "error: learner.beta=two: Value 'two'"),
         (["beta"], 2, "error: beta: not of the form key=value"),
+        (["hydra.run.dir=/dev/null/here"], 1, "error: /dev/null/here: Not a directory"),
     ]:
         done = run(*arguments, cwd=tmp_path)
         assert done.returncode == code

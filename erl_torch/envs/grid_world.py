@@ -19,14 +19,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 
 from erl_torch import checks
 from erl_torch.checks import InputError
-from erl_torch.envs.tabular import TabularEnv
 from erl_torch.mdp import TabularMDP
 
 TILES = "SFRHGWCN"
@@ -138,38 +136,3 @@ def uniform_wind(desc: Sequence[str], angle: float, strength: float) -> np.ndarr
     """The same wind on every tile, [2, rows, cols]."""
     shape = (len(desc), len(desc[0]))
     return np.stack([np.full(shape, angle, np.float64), np.full(shape, strength, np.float64)])
-
-
-class GridWorldEnv(TabularEnv):
-    """A TabularEnv on a grid, rendered as text (``ansi``) or picture (``rgb_array``)."""
-
-    metadata = {"render_modes": ["ansi", "rgb_array"], "render_fps": 4}  # noqa: RUF012
-
-    def __init__(self, grid: GridWorld, render_mode: str | None = None) -> None:
-        super().__init__(grid.mdp(), render_mode)
-        self.grid = grid
-        self._board: np.ndarray | None = None
-
-    def render(self) -> Any:
-        if self.render_mode == "ansi":
-            return self._render_text()
-        if self.render_mode == "rgb_array":
-            return self._render_picture()
-        return None
-
-    def _render_text(self) -> str:
-        cols = self.grid.shape[1]
-        cells = [
-            f"[{tile}]" if s == self.state else f" {tile} " for s, tile in enumerate(self.grid.tiles.tolist())
-        ]
-        lines = ["".join(cells[i : i + cols]) for i in range(0, len(cells), cols)]
-        if self.last_action is not None:
-            lines.insert(0, f"  ({ACTION_NAMES[self.last_action]})")
-        return "\n".join(lines) + "\n"
-
-    def _render_picture(self) -> np.ndarray:
-        from erl_torch import pictures
-
-        if self._board is None:
-            self._board = pictures.board(self.grid)
-        return pictures.with_agent(self._board, self.grid.shape, divmod(self.state, self.grid.shape[1]))

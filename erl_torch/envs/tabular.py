@@ -1,4 +1,4 @@
-"""Any TabularMDP as a Gymnasium environment."""
+"""Any TabularMDP as a Gymnasium environment, and grid worlds with their rendering."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from erl_torch.envs.grid_world import ACTION_NAMES, GridWorld
 from erl_torch.mdp import TabularMDP
 
 
@@ -53,3 +54,38 @@ class TabularEnv(gym.Env[np.int64, np.int64]):
         if self.render_mode == "ansi":
             return f"state {self.state}\n"
         return None
+
+
+class GridWorldEnv(TabularEnv):
+    """A TabularEnv on a grid, rendered as text (``ansi``) or picture (``rgb_array``)."""
+
+    metadata = {"render_modes": ["ansi", "rgb_array"], "render_fps": 4}  # noqa: RUF012
+
+    def __init__(self, grid: GridWorld, render_mode: str | None = None) -> None:
+        super().__init__(grid.mdp(), render_mode)
+        self.grid = grid
+        self._board: np.ndarray | None = None
+
+    def render(self) -> Any:
+        if self.render_mode == "ansi":
+            return self._render_text()
+        if self.render_mode == "rgb_array":
+            return self._render_picture()
+        return None
+
+    def _render_text(self) -> str:
+        cols = self.grid.shape[1]
+        cells = [
+            f"[{tile}]" if s == self.state else f" {tile} " for s, tile in enumerate(self.grid.tiles.tolist())
+        ]
+        lines = ["".join(cells[i : i + cols]) for i in range(0, len(cells), cols)]
+        if self.last_action is not None:
+            lines.insert(0, f"  ({ACTION_NAMES[self.last_action]})")
+        return "\n".join(lines) + "\n"
+
+    def _render_picture(self) -> np.ndarray:
+        from erl_torch import pictures
+
+        if self._board is None:
+            self._board = pictures.board(self.grid)
+        return pictures.with_agent(self._board, self.grid.shape, divmod(self.state, self.grid.shape[1]))

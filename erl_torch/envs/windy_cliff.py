@@ -6,7 +6,8 @@ import math
 
 from erl_torch import checks
 from erl_torch.checks import InputError
-from erl_torch.envs.grid_world import GridWorld, GridWorldEnv, uniform_wind
+from erl_torch.envs.grid_world import GridWorld, uniform_wind
+from erl_torch.envs.tabular import GridWorldEnv
 
 DESC = ("HGR", "HFF", "HFF", "HFF", "HSR")
 
