@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from erl_torch.learners.algorithm_s1 import AlgorithmS1, NonFiniteError, S1State
     from erl_torch.mdp import TabularMDP
     from erl_torch.solution import Solution, Status
+    from erl_torch.solvers import certify, iterate_biasing, perron, solve_biasing, solve_soft_bellman
     from erl_torch.transitions import Transitions
 
 __version__ = "0.1.0"
@@ -29,6 +30,11 @@ _HOME = {
     "NonFiniteError": "learners.algorithm_s1",
     "S1State": "learners.algorithm_s1",
     "Solution": "solution",
+    "certify": "solvers",
+    "iterate_biasing": "solvers",
+    "perron": "solvers",
+    "solve_biasing": "solvers",
+    "solve_soft_bellman": "solvers",
     "Status": "solution",
     "TabularMDP": "mdp",
     "Transitions": "transitions",
@@ -46,8 +52,13 @@ __all__ = [
     "Status",
     "TabularMDP",
     "Transitions",
+    "certify",
     "collect",
     "evaluate",
+    "iterate_biasing",
+    "perron",
+    "solve_biasing",
+    "solve_soft_bellman",
 ]
 
 

@@ -11,7 +11,13 @@ import numpy as np
 from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
 
-LAYOUT = {
+RETURNS = {
+    "Returns": {
+        "reward per step and objective": ["Multiline", ["eval/reward_per_step", "eval/objective"]],
+        "episode return": ["Multiline", ["eval/return"]],
+    }
+}
+S1_LAYOUT = {
     "rho and theta": {
         "rho": ["Multiline", ["s1/rho"]],
         "theta": ["Multiline", ["s1/theta"]],
@@ -19,19 +25,24 @@ LAYOUT = {
         "psi error": ["Multiline", ["s1/psi_error"]],
     },
     "Reward bias": {"delta": ["Multiline", ["s1/delta_max", "s1/delta_mean"]]},
-    "Returns": {
-        "reward per step and objective": ["Multiline", ["eval/reward_per_step", "eval/objective"]],
-        "episode return": ["Multiline", ["eval/return"]],
+} | RETURNS
+EXACT_LAYOUT = {
+    "theta": {
+        "theta with its bounds": ["Margin", ["exact/theta", "exact/theta_lower", "exact/theta_upper"]],
+        "KL to the dynamics": ["Multiline", ["exact/kl_max"]],
     },
-}
+    "Reward bias": {"delta": ["Multiline", ["exact/delta_max", "exact/delta_mean"]]},
+} | RETURNS
 
 
 class Board:
     """Writes records against tuples streamed. A context manager: what was logged survives an exception."""
 
-    def __init__(self, directory: str | os.PathLike[str], hyperparameters: Mapping[str, Any]) -> None:
+    def __init__(
+        self, directory: str | os.PathLike[str], hyperparameters: Mapping[str, Any], layout: Mapping[str, Any]
+    ) -> None:
         self._writer = SummaryWriter(str(directory))
-        self._writer.add_custom_scalars(LAYOUT)
+        self._writer.add_custom_scalars(layout)
         # Session start and end go into the run's own file: add_hparams would open a run directory more.
         # No experiment summary: TensorBoard takes the first it finds and hides other runs' columns.
         _, self._session_start, self._session_end = hparams(dict(hyperparameters), {})  # type: ignore[no-untyped-call]

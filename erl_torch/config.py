@@ -57,6 +57,18 @@ class S1:
 
 
 @dataclass
+class Exact:
+    """The arguments of ``erl_torch.learners.Exact``."""
+
+    name: str = "exact"
+    beta: float = 10.0
+    method: str = "biasing"
+    tol: float = 1e-10
+    max_steps: int = 200
+    prior_policy: str | None = None
+
+
+@dataclass
 class Simulate:
     name: str = "simulate"
     n_episodes: int = 500
@@ -78,6 +90,7 @@ class Standard:
     n_episodes: int = 20
     horizon: int = 1000
     pictures: bool = True
+    certify: bool = True
 
 
 @dataclass
@@ -92,7 +105,7 @@ class Train:
 
 SCHEMAS: dict[str, dict[str, type]] = {
     "env": {"windy_cliff": WindyCliff, "gym": Gym},
-    "learner": {"s1": S1},
+    "learner": {"s1": S1, "exact": Exact},
     "experience": {"simulate": Simulate, "recorded": Recorded},
     "evaluation": {"standard": Standard},
 }

@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 import scipy.sparse as sp
-import scipy.sparse.csgraph as csgraph
 import scipy.sparse.linalg as spla
 
 from erl_torch import kernels
+from erl_torch.chains import RegenerativeLU, classes
 from erl_torch.experience import known_mdp, policy_cdf, reset, sampling_tables, sizes
 from erl_torch.mdp import TabularMDP, check_policy
 
@@ -63,38 +63,34 @@ def stationary_distribution(transition: sp.csr_array, start: np.ndarray) -> np.n
     Periodic chains and chains with several closed classes are fine: each class counts by the probability
     of ending in it.
     """
-    n = len(start)
     chain = sp.csr_array(transition)
     chain.eliminate_zeros()
-    _, label = csgraph.connected_components(chain, directed=True, connection="strong")
-    origin, target = np.repeat(np.arange(n), np.diff(chain.indptr)), chain.indices
-    leaves = np.zeros(label.max() + 1, bool)
-    leaves[label[origin[label[origin] != label[target]]]] = True
-    transient = leaves[label]
+    label, closed = classes(chain)
+    transient = ~closed[label]
     # Expected visits to transient states, hence the flow into each closed class.
     inflow = start.copy()
     if transient.any():
         among = chain[transient][:, transient]
         visits = spla.spsolve(sp.csc_array(sp.eye_array(int(transient.sum())) - among.T), start[transient])
         inflow = inflow + chain[transient].T @ np.atleast_1d(visits)
-    share = np.zeros(n)
-    for component in np.unique(label[~transient]):
-        inside = label == component
+    share = np.zeros(len(start))
+    for c in np.flatnonzero(closed):
+        inside = label == c
         mass = inflow[inside].sum()
         if mass > 0:
-            share[inside] = mass * _stationary_irreducible(chain[inside][:, inside])
+            share[inside] = mass * RegenerativeLU.adapted(sp.csr_array(chain[inside][:, inside]), 0).stationary()
     return share
 
 
-def _stationary_irreducible(chain: sp.csr_array) -> np.ndarray:
-    n = chain.shape[0]
-    if n == 1:
-        return np.ones(1)
-    # d (I - P) = 0 with d[0] = 1: the rest is a nonsingular system.
-    system = sp.csc_array((sp.eye_array(n) - chain).T)
-    d = np.concatenate([[1.0], np.atleast_1d(spla.spsolve(system[1:, 1:], -system[1:, [0]].toarray().ravel()))])
-    d = np.maximum(d, 0.0)
-    return d / d.sum()  # type: ignore[no-any-return]
+def induced_distribution(mdp: TabularMDP, policy: np.ndarray, horizon: int | None = None) -> np.ndarray:
+    """Share of time in each state [S] under ``policy``: in the long run, or over ``horizon`` steps from the start."""
+    chain = policy_chain(mdp, policy).transition
+    if horizon is None:
+        return stationary_distribution(chain, mdp.start)
+    share, now = np.zeros(mdp.n_states), mdp.start
+    for _ in range(horizon):
+        share, now = share + now, chain.T @ now
+    return share / horizon
 
 
 def objective(mdp: TabularMDP, policy: np.ndarray, prior: np.ndarray, beta: float) -> float:

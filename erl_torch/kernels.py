@@ -155,9 +155,7 @@ def _is_healthy(z, q):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def u_epoch(
-    pair, pair_next, factor, noisy, g, z, inv_rho, lr_u, lr_rho, inv_rho_min, new, rescale_every, begin, end
-):
+def u_epoch(pair, pair_next, factor, noisy, g, z, inv_rho, lr_u, lr_rho, inv_rho_min, new, rescale_every, begin, end):
     """Lines 9-11 over tuples begin..end; z [n_pairs] changes in place.
 
     Every ``rescale_every`` tuples z is multiplied by a power of two that brings its mean to about 1: the
@@ -304,3 +302,49 @@ def finite_horizon_return(indptr, indices, data, reward, start, horizon):
                     after[indices[m]] += now[s] * data[m]
         now, after = after, now
     return total
+
+
+# ---------------------------------------------------------------------------------------------------
+# Exact solvers: expectations under the tilted dynamics, in logarithms
+# ---------------------------------------------------------------------------------------------------
+
+
+@numba.njit(cache=True, error_model="numpy")
+def tilt_rows(indptr, indices, data, h, log_mean, kl, tilted):
+    """For each row: log_mean = log sum_j p_j exp(h_j), tilted_j = p_j exp(h_j - log_mean), and
+    kl = sum_j tilted_j log(tilted_j / p_j).
+
+    CSR rows of positive entries; h [n_columns] of any size. Fills log_mean, kl [rows] and tilted (as data).
+    """
+    for row in range(indptr.size - 1):
+        top = -np.inf
+        for m in range(indptr[row], indptr[row + 1]):
+            top = max(top, h[indices[m]])
+        total = 0.0
+        for m in range(indptr[row], indptr[row + 1]):
+            tilted[m] = data[m] * math.exp(h[indices[m]] - top)
+            total += tilted[m]
+        log_total = math.log(total)
+        average = 0.0
+        for m in range(indptr[row], indptr[row + 1]):
+            tilted[m] /= total
+            average += tilted[m] * (h[indices[m]] - top)
+        log_mean[row] = top + log_total
+        kl[row] = max(average - log_total, 0.0)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def lazy_power(indptr, indices, data, y, steps):
+    """``steps`` steps y <- y/max(y) + M y/max(M y) of a CSR matrix; y [n] > 0 changes in place."""
+    after = np.empty_like(y)
+    for _ in range(steps):
+        top = 0.0
+        for row in range(y.size):
+            total = 0.0
+            for m in range(indptr[row], indptr[row + 1]):
+                total += data[m] * y[indices[m]]
+            after[row] = total
+            top = max(top, total)
+        scale = 1.0 / np.max(y)
+        for row in range(y.size):
+            y[row] = y[row] * scale + after[row] / top

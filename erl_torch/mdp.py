@@ -98,9 +98,7 @@ def _csr(value: Any, n_states: int, n_actions: int) -> sp.csr_array:
         value = value.detach().cpu()
         if str(value.layout) != "torch.strided":
             value = value.to_sparse_coo().coalesce()
-            value = sp.coo_array(
-                (value.values().numpy(), tuple(value.indices().numpy())), shape=tuple(value.shape)
-            )
+            value = sp.coo_array((value.values().numpy(), tuple(value.indices().numpy())), shape=tuple(value.shape))
     if not sp.issparse(value):
         value = _dense("transition", value)
         if value.shape == (n_states, n_actions, n_states):

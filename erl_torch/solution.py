@@ -5,21 +5,28 @@ from __future__ import annotations
 import enum
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
+from erl_torch.checks import InputError
 from erl_torch.files import read_npz, write_npz
 
 
 class Status(enum.Enum):
     """How a run ended; the value says what to do next."""
 
-    COMPLETED = (
-        "all passes made; the steps are constant, so judge convergence by theta of the last biasing iterations"
+    COMPLETED = "all passes made; the steps are constant, so judge convergence by theta of the last biasing iterations"
+    CONVERGED = "the certificate is as narrow as asked for"
+    STEP_LIMIT = "max_steps met before tol: raise max_steps; the bounds hold as they stand"
+    STAGNATED = (
+        "rounding, or a nearly closed set of states, ends progress above tol; the bounds hold as they stand. "
+        "Raise tol or lower beta"
     )
+    REDUCIBLE = "the states that the start leads to are not one recurrent class; the message names them"
     STOPPED = "stopped by the caller before the last pass; the tables are those of the last full epoch"
     PSI_LIMIT = "the psi phase met max_psi_epochs before psi_tol: raise max_psi_epochs or lr_psi"
     NON_FINITE = "a table left the positive finite numbers; the tables are those of the last good epoch"
@@ -43,39 +50,52 @@ class Solution:
     status: Status
     message: str = ""  # where and why, if the run failed
     history: Mapping[str, np.ndarray] = field(default_factory=dict)
+    beta: float | None = None
+    value: torch.Tensor | None = None  # V(s), [S], reward, up to a constant; exact solvers
+    action_value: torch.Tensor | None = None  # Q(s,a), [S, A], with the same constant
+    theta_bounds: tuple[float, float] | None = None  # two-sided, on theta*; where the model is known
+    gap: float | None = None  # at least -theta* - J(policy), reward a step; where the model is known
+    k: int | None = None  # biasing iterations as the paper's Table S1 counts them
+
+    def value_functions(self, n_steps: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+        """(Q [S, A], V [S]) of equations (1) and (2) for trajectories of ``n_steps``; reward, up to a constant.
+
+        Q = -theta N + log(u)/beta, V = -theta N + log(sum_a prior u)/beta.
+        """
+        if self.action_value is not None and self.value is not None:
+            return self.action_value - self.theta * n_steps, self.value - self.theta * n_steps
+        if self.beta is None:
+            raise ValueError("value_functions needs beta, which this solution does not carry")
+        return self.u.log() / self.beta - self.theta * n_steps, -self.psi.log() / self.beta - self.theta * n_steps
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write everything to an npz file; the history's arrays are named ``history/...``."""
-        tables = {
-            "policy": self.policy,
-            "u": self.u,
-            "psi": self.psi,
-            "reward_bias": self.reward_bias,
-        }
-        arrays = {name: np.asarray(table.detach().cpu()) for name, table in tables.items()}
-        scalars = {
-            "rho": self.rho,
-            "theta": self.theta,
-            "reward_bias_max": self.reward_bias_max,
-            "n_steps": self.n_steps,
-            "status": self.status.name,
-            "message": self.message,
-        }
-        history = {f"history/{name}": values for name, values in self.history.items()}
-        return write_npz(path, arrays | scalars | history)
+        arrays: dict[str, object] = {}
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if item.name == "history":
+                arrays |= {f"history/{name}": values for name, values in value.items()}
+            elif isinstance(value, torch.Tensor):
+                arrays[item.name] = value.detach().cpu().numpy()
+            elif value is not None:
+                arrays[item.name] = value.name if isinstance(value, Status) else value
+        return write_npz(path, arrays)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Solution:
         """Read what ``save`` wrote. Raises InputError naming the file."""
         arrays = read_npz(path)
-        tables = {name: torch.from_numpy(arrays[name]) for name in ("policy", "u", "psi", "reward_bias")}
-        return cls(
-            **tables,
-            rho=float(arrays["rho"]),
-            theta=float(arrays["theta"]),
-            reward_bias_max=float(arrays["reward_bias_max"]),
-            n_steps=int(arrays["n_steps"]),
-            status=Status[str(arrays["status"])],
-            message=str(arrays["message"]),
-            history={k.removeprefix("history/"): v for k, v in arrays.items() if k.startswith("history/")},
-        )
+        values: dict[str, Any] = {"history": {}}
+        for name, array in arrays.items():
+            if name.startswith("history/"):
+                values["history"][name.removeprefix("history/")] = array
+            elif name == "theta_bounds":
+                values[name] = (float(array[0]), float(array[1]))
+            elif array.ndim:
+                values[name] = torch.from_numpy(array)
+            else:
+                values[name] = array.item()
+        try:
+            return cls(**(values | {"status": Status[values["status"]]}))
+        except (KeyError, TypeError) as error:
+            raise InputError("path", path, f"a solution as Solution.save writes it ({error})") from error

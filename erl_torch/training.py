@@ -22,18 +22,21 @@ from tqdm import tqdm
 
 import erl_torch
 from erl_torch import checks, kernels, pictures
-from erl_torch.board import Board
+from erl_torch.board import EXACT_LAYOUT, S1_LAYOUT, Board
 from erl_torch.checks import InputError
 from erl_torch.config import check_keys
 from erl_torch.envs.grid_world import GridWorld
 from erl_torch.evaluation import Evaluation, evaluate
-from erl_torch.experience import collect, sizes
+from erl_torch.experience import collect, known_mdp, sizes
 from erl_torch.files import read_npy, write_json
-from erl_torch.learners import LEARNERS, NonFiniteError, S1State
+from erl_torch.learners import LEARNERS, AlgorithmS1, Exact, ExactState, NonFiniteError, S1State
 from erl_torch.mdp import check_policy
 from erl_torch.rng import Streams, streams
 from erl_torch.solution import Solution, Status
+from erl_torch.solvers import certify
 from erl_torch.transitions import Transitions
+
+SafePoint = Callable[[], None]
 
 
 def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lambda: None) -> dict[str, Any]:
@@ -61,8 +64,7 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
         n_states, n_actions = sizes(env)
         learner = _make_learner(cfg.learner, n_states, n_actions)
         prior = check_policy("learner.prior_policy", learner.prior_policy, n_states, n_actions)
-        data = _experience(cfg.experience, env, n_states, n_actions, rng, prior, safe_point)
-        safe_point()
+        run = (_Solving if isinstance(learner, Exact) else _Learning)(cfg, env, learner, rng, prior, safe_point)
 
         def measure(policy: torch.Tensor) -> Evaluation:
             e = cfg.evaluation
@@ -72,42 +74,163 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
         history: list[dict[str, float]] = []
         stopped: BaseException | None = None
         clock = _Stopwatch()
-        hyperparameters = _flat({**cfg.learner, "seed": cfg.seed, "n_experience": len(data)})
-        with Board(directory, hyperparameters) as board:
+        hyperparameters = _flat({**cfg.learner, "seed": cfg.seed, "n_experience": run.n_experience})
+        with Board(directory, hyperparameters, run.layout) as board:
             board.text("configuration", f"```yaml\n{OmegaConf.to_yaml(cfg, resolve=True)}```")
             first = last = measure(state.policy)
-            board.scalars(_tags(state, first), 0)
+            board.scalars(run.tags(state, first), 0)
             drawer = _Drawer(board, getattr(env.unwrapped, "grid", None)) if cfg.evaluation.pictures else None
             if drawer:
-                drawer.policy(state, "prior policy")
+                drawer.policy(state, 0, "prior policy")
             # Whatever ends the loop, what was learnt until then is written below.
             try:
-                with _Progress(learner, len(data)) as progress:
-                    for state in clock.time(learner.iterate(data, n_states, n_actions)):
+                with run.bar() as bar:
+                    for state in clock.time(run.states()):
                         history.append(state.metrics())
-                        ends_phase = state.epoch == learner.n_epochs
-                        if ends_phase or len(history) % cfg.evaluation.every == 0:
+                        step, milestone = run.step(state), run.milestone(state)
+                        if milestone or len(history) % cfg.evaluation.every == 0:
                             last = measure(state.policy)
-                            board.scalars(_tags(state, last), state.n_tuples)
-                        if ends_phase and drawer:
-                            drawer.policy(state, f"policy, biasing iteration {state.bias_iteration}")
-                            drawer.bias(state)
-                        progress.advance(state, last, ends_phase)
+                            board.scalars(run.tags(state, last), step)
+                        if milestone and drawer:
+                            drawer.policy(state, step, f"policy, {milestone}")
+                            drawer.bias(state, step, f"reward bias, {milestone}")
+                        bar.set_postfix_str(run.postfix(state), refresh=False)
+                        bar.update(step - bar.n)
+                        if milestone:
+                            _say(milestone, state, last)
                         safe_point()
             except (NonFiniteError, KeyboardInterrupt, SystemExit) as error:
                 stopped = error
-            failure = stopped if isinstance(stopped, NonFiniteError) else None
-            solution = learner.solution(state, history, failure)
-            rate = state.n_tuples / max(clock.seconds, 1e-9)
-            board.scalars({"time/tuples_per_second": rate}, state.n_tuples)
+            solution = run.solution(state, history, stopped)
+            mdp = known_mdp(env)
+            if mdp is not None and solution.theta_bounds is None and cfg.evaluation.certify:
+                solution = certify(solution, mdp, learner.beta, prior)
+            rate = run.step(state) / max(clock.seconds, 1e-9)
+            board.scalars({f"time/{run.unit}_per_second": rate}, run.step(state))
 
     solution.save(directory / "solution.npz")
-    result = _result(cfg, solution, last, len(data), clock.seconds, time.perf_counter() - began)
+    seconds = time.perf_counter() - began
+    result = _result(cfg, solution, last, run.n_experience, clock.seconds, seconds)
     write_json(directory / "result.json", result)
-    print(_summary(cfg, first, last, start, result, directory))
+    print(_summary(cfg, first, last, start, result, directory, run.unit))
     if stopped is not None:
         raise stopped
     return result
+
+
+class _Learning:
+    """A run that learns from a stream of tuples."""
+
+    unit = "tuples"
+    layout = S1_LAYOUT
+
+    def __init__(
+        self,
+        cfg: DictConfig,
+        env: Any,
+        learner: AlgorithmS1,
+        rng: Streams,
+        prior: np.ndarray,
+        safe_point: SafePoint,
+    ) -> None:
+        self.learner = learner
+        self.sizes = sizes(env)
+        self.data = _experience(cfg.experience, env, *self.sizes, rng, prior, safe_point)
+        self.n_experience = len(self.data)
+        safe_point()
+
+    def states(self) -> Iterator[S1State]:
+        return self.learner.iterate(self.data, *self.sizes)
+
+    def step(self, state: S1State) -> int:
+        return state.n_tuples
+
+    def milestone(self, state: S1State) -> str:
+        return f"biasing iteration {state.bias_iteration}" if state.epoch == self.learner.n_epochs else ""
+
+    def tags(self, state: S1State, measured: Evaluation) -> dict[str, float]:
+        logged = ("rho", "theta", "delta_max", "delta_mean", "psi_error", "psi_epochs", "bias_iteration")
+        metrics = state.metrics()
+        return {f"s1/{name}": metrics[name] for name in logged} | _evaluation_tags(measured)
+
+    def postfix(self, state: S1State) -> str:
+        place = f"bias {state.bias_iteration}/{self.learner.n_bias - 1} epoch {state.epoch}"
+        return f"{place} rho {state.rho:.3e} theta {state.theta:.4f}"
+
+    def bar(self) -> tqdm:
+        return _bar(self.learner.n_bias * self.learner.n_epochs * self.n_experience, self.unit)
+
+    def solution(self, state: S1State, history: list[dict[str, float]], stopped: BaseException | None) -> Solution:
+        return self.learner.solution(state, history, stopped if isinstance(stopped, NonFiniteError) else None)
+
+
+class _Solving:
+    """A run that solves the environment's model."""
+
+    unit = "iterations"
+    layout = EXACT_LAYOUT
+    n_experience = 0
+
+    def __init__(
+        self, cfg: DictConfig, env: Any, learner: Exact, rng: Streams, prior: np.ndarray, safe_point: SafePoint
+    ) -> None:
+        mdp = known_mdp(env)
+        if mdp is None:
+            raise InputError(
+                "learner", "exact", f"one that learns from experience: no model of {cfg.env.name} is known"
+            )
+        self.learner, self.mdp = learner, mdp
+
+    def states(self) -> Iterator[ExactState]:
+        return self.learner.iterate(self.mdp)
+
+    def step(self, state: ExactState) -> int:
+        return state.step
+
+    def milestone(self, state: ExactState) -> str:
+        if self.learner.method == "biasing":
+            return f"biasing iteration {state.step - 1}"
+        return f"Newton step {state.step}"
+
+    def tags(self, state: ExactState, measured: Evaluation) -> dict[str, float]:
+        known = {f"exact/{name}": value for name, value in state.metrics().items() if np.isfinite(value)}
+        return known | _evaluation_tags(measured)
+
+    def postfix(self, state: ExactState) -> str:
+        return f"theta {state.theta:.6f} in [{state.theta_bounds[0]:.6f}, {state.theta_bounds[1]:.6f}]"
+
+    def bar(self) -> tqdm:
+        return _bar(None, self.unit)
+
+    def solution(self, state: ExactState, history: list[dict[str, float]], stopped: BaseException | None) -> Solution:
+        return self.learner.solution(self.mdp, state, history, stopped is not None)
+
+
+def _bar(total: int | None, unit: str) -> tqdm:
+    return tqdm(
+        total=total, desc="learning", unit=f" {unit}", unit_scale=True, disable=None,
+        bar_format="{l_bar}{bar:20}| {elapsed}<{remaining}, {rate_fmt}{postfix}" if total else None,
+    )  # fmt: skip
+
+
+def _evaluation_tags(measured: Evaluation) -> dict[str, float]:
+    return {
+        "eval/return": measured.mean_return,
+        "eval/reward_per_step": measured.reward_per_step,
+        "eval/objective": measured.objective,
+    }
+
+
+def _say(milestone: str, state: S1State | ExactState, measured: Evaluation) -> None:
+    if isinstance(state, S1State):
+        found = f"rho {state.rho:.4e}  theta {state.theta:.5f}"
+    else:
+        found = f"theta {state.theta:.10f} in [{state.theta_bounds[0]:.10f}, {state.theta_bounds[1]:.10f}]"
+    tqdm.write(
+        f"{milestone}: {found}  delta max {state.reward_bias_max:.4f}  "
+        f"reward per step {measured.reward_per_step:.4f}  objective {measured.objective:.4f}",
+        file=sys.stderr,
+    )
 
 
 class _Stopwatch:
@@ -116,7 +239,7 @@ class _Stopwatch:
     def __init__(self) -> None:
         self.seconds = 0.0
 
-    def time(self, states: Iterator[S1State]) -> Iterator[S1State]:
+    def time(self, states: Iterator[Any]) -> Iterator[Any]:
         while True:
             tick = time.perf_counter()
             try:
@@ -209,62 +332,17 @@ def _check_evaluation(cfg: DictConfig) -> None:
 # -- what is shown ----------------------------------------------------------------------------------
 
 
-def _tags(state: S1State, measured: Evaluation) -> dict[str, float]:
-    logged = ("rho", "theta", "delta_max", "delta_mean", "psi_error", "psi_epochs", "bias_iteration")
-    metrics = state.metrics()
-    return {f"s1/{name}": metrics[name] for name in logged} | {
-        "eval/return": measured.mean_return,
-        "eval/reward_per_step": measured.reward_per_step,
-        "eval/objective": measured.objective,
-    }
-
-
 class _Drawer:
     def __init__(self, board: Board, grid: GridWorld | None) -> None:
         self.board, self.grid = board, grid
 
-    def policy(self, state: S1State, title: str) -> None:
-        pixels = pictures.policy_picture(state.policy.cpu().numpy(), self.grid, title)
-        self.board.picture("policy", pixels, state.n_tuples)
+    def policy(self, state: S1State | ExactState, step: int, title: str) -> None:
+        self.board.picture("policy", pictures.policy_picture(state.policy.cpu().numpy(), self.grid, title), step)
 
-    def bias(self, state: S1State) -> None:
-        title = f"reward bias, biasing iteration {state.bias_iteration}"
-        pixels = pictures.bias_picture(state.reward_bias.cpu().numpy(), self.grid, title)
-        self.board.picture("reward_bias", pixels, state.n_tuples)
-
-
-class _Progress:
-    """A bar on a terminal; in a pipe, one line a biasing iteration."""
-
-    def __init__(self, learner: Any, n_tuples: int) -> None:
-        self.n_bias, self.n_tuples = learner.n_bias, n_tuples
-        self.bar = tqdm(
-            total=learner.n_bias * learner.n_epochs * n_tuples,
-            desc="learning", unit=" tuples", unit_scale=True, disable=None,
-            bar_format="{l_bar}{bar:20}| {elapsed}<{remaining}, {rate_fmt}{postfix}",
-        )  # fmt: skip
-
-    def __enter__(self) -> _Progress:
-        self.bar.__enter__()
-        return self
-
-    def __exit__(self, *error: Any) -> None:
-        self.bar.__exit__(*error)
-
-    def advance(self, state: S1State, measured: Evaluation, ends_phase: bool) -> None:
-        self.bar.set_postfix_str(
-            f"bias {state.bias_iteration}/{self.n_bias - 1} epoch {state.epoch} "
-            f"rho {state.rho:.3e} theta {state.theta:.4f}",
-            refresh=False,
+    def bias(self, state: S1State | ExactState, step: int, title: str) -> None:
+        self.board.picture(
+            "reward_bias", pictures.bias_picture(state.reward_bias.cpu().numpy(), self.grid, title), step
         )
-        self.bar.update(self.n_tuples)
-        if ends_phase:
-            tqdm.write(
-                f"biasing iteration {state.bias_iteration}: rho {state.rho:.4e}  theta {state.theta:.5f}  "
-                f"delta max {state.reward_bias_max:.4f}  reward per step {measured.reward_per_step:.4f}  "
-                f"objective {measured.objective:.4f}",
-                file=sys.stderr,
-            )
 
 
 def _result(
@@ -283,8 +361,11 @@ def _result(
         "reward_per_step": last.reward_per_step,
         "objective": last.objective,
         "return": last.mean_return,
+        "theta_bounds": list(solution.theta_bounds) if solution.theta_bounds else None,
+        "gap": solution.gap,
+        "k": solution.k,
         "n_experience": n_data,
-        "n_tuples": solution.n_steps,
+        "n_tuples" if n_data else "n_iterations": solution.n_steps,
         "seconds_learning": round(learning, 3),
         "seconds": round(seconds, 3),
         "versions": {
@@ -298,15 +379,21 @@ def _result(
 
 
 def _summary(
-    cfg: DictConfig, first: Evaluation, last: Evaluation, start: S1State, result: dict[str, Any], directory: Path
+    cfg: DictConfig,
+    first: Evaluation,
+    last: Evaluation,
+    start: Any,
+    result: dict[str, Any],
+    directory: Path,
+    unit: str,
 ) -> str:
     with contextlib.suppress(ValueError):
         directory = directory.resolve().relative_to(Path.cwd())
     logs = "runs" if directory.parts[0] == "runs" else directory
-    rate = result["n_tuples"] / max(result["seconds_learning"], 1e-3) / 1e6
+    done = result[f"n_{unit}"]
     rows = [
         ("theta", f"{start.theta:12.5f}", f"{result['theta']:12.5f}"),
-        ("rho", f"{start.rho:12.4e}", f"{result['rho']:12.4e}"),
+        *([("rho", f"{start.rho:12.4e}", f"{result['rho']:12.4e}")] if isinstance(start, S1State) else []),
         ("reward per step", f"{first.reward_per_step:12.5f}", f"{last.reward_per_step:12.5f}"),
         ("objective", f"{first.objective:12.5f}", f"{last.objective:12.5f}"),
         ("episode return", f"{first.mean_return:12.2f}", f"{last.mean_return:12.2f}"),
@@ -316,18 +403,28 @@ def _summary(
         f"{cfg.env.name}, {cfg.learner.name}, beta {cfg.learner.beta:g}, seed {cfg.seed}: {result['status']}",
         f"{'':18}{'prior':>12}{'learnt':>12}",
         *(f"{name:18}{before}{after}" for name, before, after in rows),
-        f"{'tuples streamed':18}{result['n_tuples']:,} (of {result['n_experience']:,}; {rate:.3g} M/s)",
+    ]
+    if result["theta_bounds"] is not None:
+        low, high = result["theta_bounds"]
+        gap = "" if result["gap"] is None else f"; objective at most {result['gap']:.2g} below its maximum"
+        lines.append(f"{'proven':18}theta* in [{low:.10g}, {high:.10g}]{gap}")
+    if result["n_experience"]:
+        rate = done / max(result["seconds_learning"], 1e-3) / 1e6
+        lines.append(f"{'tuples streamed':18}{done:,} (of {result['n_experience']:,}; {rate:.3g} M/s)")
+    else:
+        k = "" if result["k"] is None else f" (k = {result['k']})"
+        lines.append(f"{'iterations':18}{done}{k}")
+    lines += [
         f"{'seconds':18}{result['seconds']:.1f}, of which {result['seconds_learning']:.1f} learning",
         f"{'run directory':18}{directory}",
         f"{'look at it':18}tensorboard --logdir {logs}",
     ]
-    if result["status"] != "completed":
+    if result["status"] not in ("completed", "converged"):
         lines.append(f"{'status':18}{Status[result['status'].upper()].value}")
+        lines += [f"{'':18}{result['message']}"] if result["message"] else []
     return "\n".join(lines)
 
 
 def _flat(values: dict[str, Any]) -> dict[str, Any]:
     """Hyper-parameters as TensorBoard takes them: numbers, booleans and text."""
-    return {
-        key: value if isinstance(value, (bool, int, float, str)) else str(value) for key, value in values.items()
-    }
+    return {key: value if isinstance(value, (bool, int, float, str)) else str(value) for key, value in values.items()}

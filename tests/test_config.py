@@ -101,6 +101,8 @@ BAD_VALUES = {
     "experience.n_episodes": NOT_A_COUNT,
     "experience.episode_length": NOT_A_COUNT,
     "experience.behaviour_policy": TEXT,
+    "learner.tol": NOT_POSITIVE,
+    "learner.max_steps": NOT_A_COUNT,
     "evaluation.every": NOT_A_COUNT,
     "evaluation.n_episodes": NOT_A_COUNT,
     "evaluation.horizon": NOT_A_COUNT,
@@ -116,9 +118,9 @@ BAD_VALUES = {
 def test_bad_values_get_one_line_that_names_them(tmp_path, data):
     key = data.draw(st.sampled_from(sorted(BAD_VALUES)))
     value = data.draw(BAD_VALUES[key])
-    line = complaint(
-        tmp_path, f"{key}={value}", "experience.n_episodes=1" if "n_episodes" not in key else "seed=0"
-    )
+    exact = ["learner=exact"] if key in ("learner.tol", "learner.max_steps") else []
+    small = [] if "n_episodes" in key else ["experience.n_episodes=1"]
+    line = complaint(tmp_path, f"{key}={value}", *exact, *small)
     assert line.startswith((key, key.split(".")[-1]))
     assert "\n" not in line
     assert len(line) > len(key) + 10

@@ -5,6 +5,8 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
+import scipy.sparse as sp
+from conftest import DATA
 from gymnasium.utils.env_checker import check_env
 from scipy import stats
 
@@ -87,6 +89,19 @@ def test_cliff_is_the_authors(authors):
     assert np.array_equal(env.mdp.start, authors["start"])
 
 
+@pytest.mark.parametrize("i", range(5))
+def test_mazes_are_the_authors(i):
+    """Rebuilt from tiles and wind field alone."""
+    with np.load(DATA / "windy_mazes.npz") as data:
+        known = {name: data[f"m{i:02d}_{name}"] for name in ("desc", "wind", "indptr", "indices", "data", "R", "start")}
+    mdp = GridWorld(tuple(known["desc"]), known["wind"], trap_reward=-2.0).mdp()
+    rows = (known["data"], known["indices"], known["indptr"])
+    stored = sp.csr_array(rows, shape=mdp.transition.shape)
+    assert abs(mdp.transition - stored).max() <= 1e-12
+    np.testing.assert_allclose(mdp.reward, known["R"], atol=1e-12)
+    assert np.array_equal(mdp.start, known["start"])
+
+
 def test_cliff_ansi():
     env = WindyCliffEnv(render_mode="ansi")
     env.reset(seed=0)
@@ -149,9 +164,7 @@ def test_bad_grids_are_refused(arguments, message):
         GridWorld(**arguments)
 
 
-@pytest.mark.parametrize(
-    ("key", "value"), [("wind_strength", 1.5), ("wind_angle", np.inf), ("trap_reward", "low")]
-)
+@pytest.mark.parametrize(("key", "value"), [("wind_strength", 1.5), ("wind_angle", np.inf), ("trap_reward", "low")])
 def test_bad_cliffs_are_refused(key, value):
     with pytest.raises(InputError, match=key):
         WindyCliffEnv(**{key: value})

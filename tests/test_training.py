@@ -14,7 +14,7 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from test_config import composed
 
-from erl_torch import Solution, Status, Transitions
+from erl_torch import InputError, Solution, Status, Transitions
 from erl_torch.training import train
 
 ROOT = Path(__file__).parents[1]
@@ -51,6 +51,10 @@ def test_run_directory(finished):
     assert result["n_tuples"] == 120_000
     solution = Solution.load(directory / "solution.npz")
     assert solution.theta == result["theta"]
+    low, high = result["theta_bounds"]  # of the known model, solved at the end
+    assert low - 1e-10 <= 1.0101363366 <= high + 1e-10
+    assert high - low < 1e-8
+    assert result["gap"] == pytest.approx(-low - result["objective"], abs=1e-9)
     assert solution.theta == pytest.approx(-np.log(solution.rho) / 10 - solution.reward_bias_max, rel=1e-14)
     assert {"erl_torch", "python", "torch", "numpy", "gymnasium"} == set(result["versions"])
 
@@ -136,6 +140,36 @@ def test_environment_without_a_model(tmp_path):
     assert result["status"] == "completed"
     assert result["reward_per_step"] > 5 * max(first, 0.001)
     assert events(tmp_path).Images("policy")[-1].height == 400
+
+
+@pytest.mark.parametrize("method", ["biasing", "soft_bellman"])
+def test_exact_learner(tmp_path, method):
+    result = train(composed("learner=exact", f"learner.method={method}", "experience.n_episodes=1"), tmp_path)
+    assert result["status"] == "converged"
+    assert result["theta"] == pytest.approx(1.0101363366, abs=1e-9)
+    assert result["objective"] == pytest.approx(-1.0101363366, abs=1e-9)
+    assert result["theta_bounds"][0] <= result["theta"] <= result["theta_bounds"][1]
+    assert result["gap"] < 1e-9
+    assert result["k"] == (5 if method == "biasing" else None)
+    assert result["n_experience"] == 0
+    reader = events(tmp_path)
+    low, theta, high = (
+        [e.value for e in reader.Scalars(f"exact/{n}")] for n in ("theta_lower", "theta", "theta_upper")
+    )
+    assert len(low) == len(high) == result["n_iterations"]
+    assert all(a <= b + 1e-6 for a, b in zip(low, high, strict=True))
+    assert theta[-1] == pytest.approx(1.0101363366, abs=1e-6)
+    assert reader.Scalars("exact/kl_max")[-1].value < 1e-6
+    assert len(reader.Images("policy")) == result["n_iterations"] + 1
+    text = (ROOT / "docs" / "logging.md").read_text()
+    assert all(f"`{tag}`" in text for tag in reader.Tags()["scalars"])
+    history = Solution.load(tmp_path / "solution.npz").history
+    assert len(history["theta"]) == result["n_iterations"]
+
+
+def test_exact_learner_needs_a_model(tmp_path):
+    with pytest.raises(InputError, match="learner=exact: must be one that learns from experience: no model of Froz"):
+        train(composed("learner=exact", "env=gym", "env.id=FrozenLake-v1"), tmp_path)
 
 
 def test_failure_keeps_what_was_learnt(tmp_path):

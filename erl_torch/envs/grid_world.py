@@ -97,8 +97,7 @@ class GridWorld:
         identity = sp.eye_array(n_states, format="csr")
         moves = [self._move(move) for move in MOVES]
         blow = sum(
-            sp.diags_array(p) @ move
-            for p, move in zip(self.wind_probabilities().T, [*moves, identity], strict=True)
+            sp.diags_array(p) @ move for p, move in zip(self.wind_probabilities().T, [*moves, identity], strict=True)
         )
         start = (self.tiles == ("S" if "S" in self.tiles else "F")).astype(np.float64)
         start /= start.sum()

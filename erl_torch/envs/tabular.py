@@ -75,9 +75,7 @@ class GridWorldEnv(TabularEnv):
 
     def _render_text(self) -> str:
         cols = self.grid.shape[1]
-        cells = [
-            f"[{tile}]" if s == self.state else f" {tile} " for s, tile in enumerate(self.grid.tiles.tolist())
-        ]
+        cells = [f"[{tile}]" if s == self.state else f" {tile} " for s, tile in enumerate(self.grid.tiles.tolist())]
         lines = ["".join(cells[i : i + cols]) for i in range(0, len(cells), cols)]
         if self.last_action is not None:
             lines.insert(0, f"  ({ACTION_NAMES[self.last_action]})")

@@ -272,6 +272,7 @@ class AlgorithmS1:
             n_steps=state.n_tuples,
             status=status,
             message=str(failure) if failure else "",
+            beta=self.beta,
             history={name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else {})},
         )
 
@@ -403,9 +404,7 @@ class AlgorithmS1:
         )
         return mean_psi.to(self.device), mean_log_psi.to(self.device), epochs, error
 
-    def _psi_phase_literal(
-        self, state: S1State, stream: S1Stream
-    ) -> tuple[torch.Tensor, torch.Tensor, int, float]:
+    def _psi_phase_literal(self, state: S1State, stream: S1Stream) -> tuple[torch.Tensor, torch.Tensor, int, float]:
         mean_psi, mean_log_psi = state.mean_psi.clone(), state.mean_log_psi.clone()
         psi = state.psi
         error = math.inf

@@ -1,0 +1,143 @@
+"""The exact solvers as a learner: nothing is learnt from experience, the environment's model is solved.
+
+``method="biasing"`` runs the paper's Algorithm 1, one state a biasing iteration; ``method="soft_bellman"`` soft policy
+iteration, one state a Newton step (``erl_torch.solvers``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from erl_torch import checks
+from erl_torch.mdp import TabularMDP, check_policy
+from erl_torch.solution import Solution, Status
+from erl_torch.solvers.biasing import KL_TOLERANCE, BiasingState, iterate_biasing, solve_biasing
+from erl_torch.solvers.problem import Problem
+from erl_torch.solvers.result import bias, exact_solution, reducible_solution, spread
+from erl_torch.solvers.soft_bellman import BellmanState, iterate_soft_bellman, solve_soft_bellman
+
+
+@dataclass(frozen=True, eq=False)
+class ExactState:
+    """One iteration, on all states of the MDP."""
+
+    step: int  # biasing iteration, from 1; or Newton steps
+    policy: torch.Tensor  # [S, A]
+    reward_bias: torch.Tensor  # [S, A]
+    theta: float  # -G(V) of a biasing iteration; the middle of the bounds of a Newton step
+    theta_bounds: tuple[float, float]
+    kl_max: float  # KL(optimal dynamics || p), largest over (s,a), nats; 0 for soft_bellman
+    value: np.ndarray  # [n], on the states that the start leads to
+
+    @property
+    def reward_bias_max(self) -> float:
+        return float(self.reward_bias.max())
+
+    def metrics(self) -> dict[str, float]:
+        """The scalars that are logged, by their documented names (docs/logging.md)."""
+        return {
+            "theta": self.theta,
+            "theta_lower": self.theta_bounds[0],
+            "theta_upper": self.theta_bounds[1],
+            "delta_max": self.reward_bias_max,
+            "delta_mean": float(self.reward_bias.mean()),
+            "kl_max": self.kl_max,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Exact:
+    """Solve the environment's model.
+
+    Args:
+        beta: inverse temperature, 1/reward, > 0.
+        method: "biasing" or "soft_bellman".
+        tol: width of the bounds on theta* to stop at, relative to the range of the rewards.
+        max_steps: iterations at most.
+        prior_policy: [S, A], entries > 0; None is uniform.
+
+    Raises:
+        InputError: an argument out of its range.
+    """
+
+    beta: float = 10.0
+    method: str = "biasing"
+    tol: float = 1e-10
+    max_steps: int = 200
+    prior_policy: torch.Tensor | np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        checks.positive("beta", self.beta)
+        checks.one_of("method", self.method, ("biasing", "soft_bellman"))
+        checks.positive("tol", self.tol)
+        checks.at_least("max_steps", self.max_steps, 1)
+
+    def solve(self, mdp: TabularMDP) -> Solution:
+        """The solution with its certificate."""
+        solve = solve_biasing if self.method == "biasing" else solve_soft_bellman
+        return solve(mdp, self.beta, self.prior_policy, tol=self.tol, max_steps=self.max_steps)
+
+    def init(self, n_states: int, n_actions: int) -> ExactState:
+        """The prior policy, before anything is known."""
+        prior = check_policy("prior_policy", self.prior_policy, n_states, n_actions)
+        nothing = torch.zeros(n_states, n_actions, dtype=torch.float64)
+        return ExactState(0, torch.from_numpy(prior), nothing, 1.0, (-np.inf, np.inf), 0.0, np.zeros(0))
+
+    def iterate(self, mdp: TabularMDP) -> Iterator[ExactState]:
+        """Yield each iteration until the bounds are within ``tol``."""
+        problem = Problem.of(mdp, self.beta, self.prior_policy)
+        prior = check_policy("prior_policy", self.prior_policy, mdp.n_states, mdp.n_actions)
+        ref = problem.regeneration_state()
+        if ref is None:
+            return
+
+        def full(step: int, state: BiasingState | BellmanState, theta: float, kl_max: float) -> ExactState:
+            log_psi = state.log_psi if isinstance(state, BiasingState) else -self.beta * state.value
+            return ExactState(
+                step=step,
+                policy=spread(problem, state.policy, prior),
+                reward_bias=spread(problem, bias(problem, log_psi), np.zeros_like(prior)),
+                theta=theta,
+                theta_bounds=state.theta_bounds,
+                kl_max=kl_max,
+                value=state.value,
+            )
+
+        if self.method == "soft_bellman":
+            for newton in iterate_soft_bellman(problem, ref, self.tol, self.max_steps):
+                if newton.step:
+                    yield full(newton.step, newton, 0.5 * sum(newton.theta_bounds), 0.0)
+            return
+        for state in iterate_biasing(mdp, self.beta, self.prior_policy, max_steps=self.max_steps):
+            yield full(state.k + 1, state, state.theta, float(state.kl.max()))
+            if state.theta_bounds[1] - state.theta_bounds[0] <= self.tol * problem.reward_range:
+                return
+
+    def solution(self, mdp: TabularMDP, state: ExactState, history: list[dict[str, float]], stopped: bool) -> Solution:
+        """The solution that ``state`` stands for, with the record of the iterations."""
+        problem = Problem.of(mdp, self.beta, self.prior_policy)
+        if state.step == 0:
+            return reducible_solution(mdp, problem, self.prior_policy)
+        below = [i for i, row in enumerate(history) if row["kl_max"] < KL_TOLERANCE]
+        width = state.theta_bounds[1] - state.theta_bounds[0]
+        if stopped:
+            status = Status.STOPPED
+        elif width <= self.tol * problem.reward_range:
+            status = Status.CONVERGED
+        else:
+            status = Status.STEP_LIMIT if state.step >= self.max_steps else Status.STAGNATED
+        solution = exact_solution(
+            mdp,
+            problem,
+            state.value,
+            status,
+            state.step,
+            state.theta_bounds,
+            self.prior_policy,
+            k=below[0] if below and self.method == "biasing" else None,
+        )
+        return replace(solution, history={name: np.array([row[name] for row in history]) for name in history[0]})

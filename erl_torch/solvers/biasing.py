@@ -1,0 +1,197 @@
+"""Biasing iterations: the paper's Algorithm 1, exact.
+
+With psi = exp(-beta V), one iteration finds the dominant right eigenvector y of
+
+    M_V(s, s') = sum_a prior(a|s) exp(beta (r(s,a) + E V - V(s))) p(s'|s,a)
+
+(the tilted, biased matrix summed over actions, [S, S]) and sets V += log(y)/beta. Its root exp(beta G(V)) never rises
+from one iteration to the next, G(V) >= -theta*, and near the solution the error squares. In the iteration's own
+optimal dynamics the transition probabilities are p(s'|s,a) y(s') / <y>: once they are p, V solves the problem.
+
+Iteration 0 has V = 0, no bias: its policy is the optimistic one. Counting: ``k`` is the 0-based index of the first
+iteration with KL(optimal dynamics || p) < 1e-6 in every (s,a), which is the number of bias updates (Table S1;
+Table S2 counts eigen-solves, k + 1).
+
+Another target (equations 23-25 of the paper). If the dynamics known before, ``mdp.transition``, are not those to be
+solved for, the biased dynamics are p b ~ target psi: the old dynamics cancel, and enter iteration 0 alone, which is
+solved as the old problem and so hands its value over as the start.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from erl_torch import checks, kernels
+from erl_torch.checks import InputError
+from erl_torch.mdp import TabularMDP
+from erl_torch.solution import Solution, Status
+from erl_torch.solvers.eigenpair import solve_log_perron
+from erl_torch.solvers.problem import Problem, soft_backup, theta_bounds
+from erl_torch.solvers.result import bias, exact_solution, reducible_solution
+
+KL_TOLERANCE = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class BiasingState:
+    """One biasing iteration, on the problem's states."""
+
+    k: int  # 0-based
+    log_psi: np.ndarray  # [n], behind this iteration's biases; 0 in iteration 0
+    reward_bias: np.ndarray  # delta, [n, A], reward
+    theta: float  # -G(V), at most theta*: optimistic
+    policy: np.ndarray  # [n, A], optimal in the biased problem
+    kl: np.ndarray  # KL(optimal dynamics || target dynamics), [n, A], nats
+    value: np.ndarray  # [n], after the update: V + log(y)/beta
+    theta_bounds: tuple[float, float]  # on theta*, the best proven so far
+    status: Status  # of the eigenpair
+    newton_steps: int
+
+
+def solve_biasing(
+    mdp: TabularMDP,
+    beta: float,
+    prior_policy: Any = None,
+    target: TabularMDP | None = None,
+    tol: float = 1e-10,
+    max_steps: int = 200,
+    stop: str = "certificate",
+) -> Solution:
+    """Algorithm 1 with certificates.
+
+    Args:
+        mdp: the problem; with ``target``, what is known of it before.
+        beta, prior_policy: as in ``solve_soft_bellman``.
+        target: the MDP to be solved, if it is not ``mdp`` itself: same shapes, its dynamics and rewards count.
+        tol: width of the bounds on theta* to stop at, relative to the range of the rewards.
+        max_steps: biasing iterations at most.
+        stop: "certificate", or "kl": at iteration k already.
+
+    Returns:
+        A Solution with ``k`` (None if the KL test never held) and the certificate; status REDUCIBLE where the states
+        that the start leads to are not one class: the eigenvector needs that (``solve_soft_bellman`` needs less).
+
+    Raises:
+        InputError: an argument out of range, or a target of another shape.
+    """
+    checks.one_of("stop", stop, ("certificate", "kl"))
+    checks.positive("tol", tol)
+    problem = _problem(mdp, beta, prior_policy, target)
+    if len(problem.classes()[1]) > 1:
+        return reducible_solution(target or mdp, problem, prior_policy)
+    k: int | None = None
+    state: BiasingState | None = None
+    status = Status.STEP_LIMIT
+    for state in iterate_biasing(mdp, beta, prior_policy, target, max_steps):
+        if k is None and state.kl.max() < KL_TOLERANCE:
+            k = state.k
+        width = state.theta_bounds[1] - state.theta_bounds[0]
+        if width <= tol * problem.reward_range or (stop == "kl" and k is not None):
+            status = Status.CONVERGED
+            break
+    assert state is not None
+    if status is not Status.CONVERGED and state.k + 1 < max_steps:
+        status = Status.STAGNATED  # the iteration ended of itself
+    return exact_solution(
+        target or mdp, problem, state.value, status, state.k + 1, state.theta_bounds, prior_policy, k=k
+    )
+
+
+def iterate_biasing(
+    mdp: TabularMDP,
+    beta: float,
+    prior_policy: Any = None,
+    target: TabularMDP | None = None,
+    max_steps: int = 200,
+) -> Iterator[BiasingState]:
+    """Yield every biasing iteration; ends after ``max_steps``, or when rounding ends progress."""
+    problem = _problem(mdp, beta, prior_policy, target)
+    checks.at_least("max_steps", max_steps, 1)
+    ref = problem.regeneration_state()
+    if ref is None or len(problem.classes()[1]) > 1:
+        return
+    known = Problem.of(mdp, beta, prior_policy) if target is not None else problem
+    value = np.zeros(problem.n_states)
+    lower, upper = -np.inf, np.inf
+    shift_before = np.inf
+    for k in range(max_steps):
+        at = known if k == 0 else problem
+        h, bounds, status, newton_steps = _eigenvector(at, value, ref)
+        log_psi = -beta * value
+        # The policy and the dynamics that are optimal in the biased problem.
+        log_mean, _, tilted = _tilt(at, h)
+        q = at.action_value(value) + log_mean.reshape(at.reward.shape) / beta
+        policy = soft_backup(q, at.prior, beta)[1]
+        kl = _kl_to(problem, at, h, tilted)
+        value = value + h / beta
+        value -= value[ref]
+        backed_up, _ = soft_backup(problem.action_value(value), problem.prior, beta)
+        proven = theta_bounds(value, backed_up, problem.reward)
+        lower, upper = max(lower, proven[0]), min(upper, proven[1])
+        if lower > upper:  # by rounding alone
+            lower, upper = proven
+        yield BiasingState(
+            k=k,
+            log_psi=log_psi,
+            reward_bias=bias(problem, log_psi),
+            theta=-0.5 * sum(bounds) / beta,
+            policy=policy,
+            kl=kl,
+            value=value,
+            theta_bounds=(lower, upper),
+            status=status,
+            newton_steps=newton_steps,
+        )
+        shift = float(np.ptp(h))
+        if shift <= 1e-13 * (1 + np.abs(beta * value).max()) and shift >= 0.5 * shift_before:
+            return
+        shift_before = shift
+
+
+def _problem(mdp: TabularMDP, beta: float, prior_policy: Any, target: TabularMDP | None) -> Problem:
+    if target is None:
+        return Problem.of(mdp, beta, prior_policy)
+    if target.reward.shape != mdp.reward.shape:
+        raise InputError("target", f"MDP of shape {target.reward.shape}", f"of the shape of mdp, {mdp.reward.shape}")
+    problem, known = Problem.of(target, beta, prior_policy), Problem.of(mdp, beta, prior_policy)
+    if not np.array_equal(problem.states, known.states):
+        raise InputError("target", "MDP", "one whose start leads to the same states as that of mdp")
+    return problem
+
+
+def _tilt(problem: Problem, h: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(log <exp h> [n*A], KL(tilted || p) [n*A], tilted probabilities as CSR data)."""
+    p, n = problem.transition, problem.reward.size
+    log_mean, kl, tilted = np.empty(n), np.empty(n), np.empty(p.nnz)
+    kernels.tilt_rows(p.indptr, p.indices, p.data, h, log_mean, kl, tilted)
+    return log_mean, kl, tilted
+
+
+def _eigenvector(problem: Problem, value: np.ndarray, ref: int) -> tuple[np.ndarray, tuple[float, float], Status, int]:
+    """Right eigenvector of M_V as its logarithm, with bounds on beta G(V)."""
+    log_weight = problem.beta * (problem.action_value(value) - value[:, None])
+
+    def tilt(h: np.ndarray) -> tuple[np.ndarray, sp.csr_array]:
+        log_mean, _, tilted = _tilt(problem, h)
+        backed_up, choice = soft_backup(log_weight + log_mean.reshape(log_weight.shape), problem.prior, 1.0)
+        return backed_up, problem.chain(choice, tilted)
+
+    return solve_log_perron(tilt, np.zeros(problem.n_states), ref, 1e-13, 60)
+
+
+def _kl_to(problem: Problem, at: Problem, h: np.ndarray, tilted: np.ndarray) -> np.ndarray:
+    """KL(optimal dynamics || target dynamics), [n, A]; infinite where the target lacks a transition."""
+    if at is problem:
+        return _tilt(at, h)[1].reshape(at.reward.shape)
+    p = at.transition
+    optimal = sp.csr_array((tilted, p.indices, p.indptr), shape=p.shape)
+    rows = np.repeat(np.arange(p.shape[0]), np.diff(p.indptr))
+    wanted = np.asarray(problem.transition[rows, p.indices]).ravel()
+    with np.errstate(divide="ignore", invalid="ignore"):
+        terms = np.where(optimal.data > 0, optimal.data * np.log(optimal.data / wanted), 0.0)
+    return np.add.reduceat(terms, p.indptr[:-1]).reshape(at.reward.shape)

@@ -1,0 +1,117 @@
+"""From a value to a Solution with its certificate."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+
+from erl_torch import kernels
+from erl_torch.chains import RegenerativeLU, SingularChainError
+from erl_torch.evaluation import kl_per_state
+from erl_torch.mdp import TabularMDP, check_policy
+from erl_torch.solution import Solution, Status
+from erl_torch.solvers.problem import Problem, soft_backup, theta_bounds
+
+
+def exact_solution(
+    mdp: TabularMDP,
+    problem: Problem,
+    value: np.ndarray,
+    status: Status,
+    n_steps: int,
+    bounds: tuple[float, float],
+    prior_policy: Any = None,
+    message: str = "",
+    k: int | None = None,
+) -> Solution:
+    """The solution that ``value`` [n] (on the problem's states) stands for; theta is the middle of the bounds."""
+    beta = problem.beta
+    q = problem.action_value(value)
+    backed_up, policy = soft_backup(q, problem.prior, beta)
+    theta = 0.5 * (bounds[0] + bounds[1])
+    # log u = beta V + log(pi/prior), so Q = log(u)/beta = V + q - TV.
+    action_value = value[:, None] + q - backed_up[:, None]
+    shift = max(action_value.max(), value.max())
+    action_value, value = action_value - shift, value - shift
+    log_psi = -beta * value
+    reward_bias = bias(problem, log_psi)
+    delta = float(reward_bias.max())
+    with np.errstate(over="ignore", under="ignore"):
+        u, psi = np.exp(beta * action_value), np.exp(log_psi)
+        rho = float(np.exp(-beta * (theta + delta)))
+    prior = check_policy("prior_policy", prior_policy, mdp.n_states, mdp.n_actions)
+    return Solution(
+        policy=spread(problem, policy, prior),
+        u=spread(problem, u, np.ones_like(prior)),
+        psi=spread(problem, psi, np.ones(mdp.n_states)),
+        rho=rho,
+        theta=theta,
+        reward_bias=spread(problem, reward_bias, np.zeros_like(prior)),
+        reward_bias_max=delta,
+        n_steps=n_steps,
+        status=status,
+        message=message,
+        beta=beta,
+        value=spread(problem, value, np.zeros(mdp.n_states)),
+        action_value=spread(problem, action_value, np.zeros_like(prior)),
+        theta_bounds=bounds,
+        gap=policy_gap(problem, policy, bounds),
+        k=k,
+    )
+
+
+def bias(problem: Problem, log_psi: np.ndarray) -> np.ndarray:
+    """delta(s,a) = (log <psi> - <log psi>)/beta of equation (9), [n, A], reward."""
+    p, n = problem.transition, problem.reward.size
+    log_mean, kl, tilted = np.empty(n), np.empty(n), np.empty(p.nnz)
+    kernels.tilt_rows(p.indptr, p.indices, p.data, log_psi, log_mean, kl, tilted)
+    delta = np.maximum(log_mean - p @ log_psi, 0.0) / problem.beta
+    return np.asarray(delta.reshape(problem.reward.shape))
+
+
+def policy_gap(problem: Problem, policy: np.ndarray, bounds: tuple[float, float]) -> float | None:
+    """Upper bound on g* - J(policy), reward a step; None where the policy's chain is not one class."""
+    ref = problem.regeneration_state()
+    if ref is None:
+        return None
+    reward = (policy * problem.reward).sum(1) - kl_per_state(policy, problem.prior) / problem.beta
+    try:
+        gain, _ = RegenerativeLU.adapted(problem.chain(policy), ref).poisson(reward)
+    except SingularChainError:
+        return None
+    slack = 16 * np.finfo(np.float64).eps * (abs(gain) + np.abs(problem.reward).max())
+    return float(max(-bounds[0] - gain, 0.0) + slack)
+
+
+def reducible_solution(mdp: TabularMDP, problem: Problem, prior_policy: Any, n_steps: int = 0) -> Solution:
+    """The prior policy, the bounds it proves, and a message that names the classes."""
+    label, closed = problem.classes()
+    value = np.zeros(problem.n_states)
+    backed_up, _ = soft_backup(problem.action_value(value), problem.prior, problem.beta)
+    bounds = theta_bounds(value, backed_up, problem.reward)
+
+    def name(c: int) -> str:
+        inside = problem.states[label == c]
+        return f"{inside[:5].tolist()}{'...' if len(inside) > 5 else ''}"
+
+    ends = [name(c) for c in np.flatnonzero(closed)[:5]]
+    if closed.sum() > 1:
+        message = (
+            f"{closed.sum()} closed sets of states, {', '.join(ends)}: let the process restart from them, "
+            "or solve each apart"
+        )
+    else:
+        message = (
+            f"states outside the closed set {ends[0]} are better off never to reach it: solve them apart, or "
+            "raise what the closed set earns"
+        )
+    return exact_solution(mdp, problem, value, Status.REDUCIBLE, n_steps, bounds, prior_policy, message)
+
+
+def spread(problem: Problem, table: np.ndarray, elsewhere: np.ndarray) -> torch.Tensor:
+    """A table on the problem's states as one on all states."""
+    full = elsewhere.copy()
+    full[problem.states] = table
+    return torch.from_numpy(full)

@@ -1,0 +1,161 @@
+"""Soft policy iteration on the average-reward soft Bellman equation V + g = TV, g = -theta* (``problem.py``).
+
+T is convex and monotone and its derivative is the chain of the policy pi_V, so Newton's step, one Poisson equation of
+that chain, is soft policy iteration: J never falls, and the error squares near the solution.
+
+Far from the solution the chain of pi_V may have sets that are all but closed, which double precision cannot tell from
+closed. So the horizon is made to grow: with lambda = 1 - 1/horizon
+
+    V + g = (1/beta) log sum_a prior exp(beta (r + lambda E V)),    V(ref) = 0
+
+is the discounted problem in relative form, where Newton's matrix I - lambda K is well conditioned whatever the chain.
+Each horizon starts from the value of the one before. As soon as the certificate of the undiscounted problem (which
+every V carries) shows that the solution is near, undiscounted steps finish; where they fail, the horizon grows on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from erl_torch import checks
+from erl_torch.chains import DiscountedLU, RegenerativeLU, SingularChainError
+from erl_torch.mdp import TabularMDP
+from erl_torch.solution import Solution, Status
+from erl_torch.solvers.problem import Problem, soft_backup, theta_bounds
+from erl_torch.solvers.result import exact_solution, policy_gap, reducible_solution
+
+FIRST_HORIZON = 30.0  # steps
+GROWTH = 30.0
+LAST_HORIZON = 1e13
+LOOSE = 0.03  # residual, relative to the reward range, at which the horizon grows
+NEAR = 0.1  # width of the undiscounted bounds, relative to the reward range, at which discounting may end
+
+
+@dataclass(frozen=True, eq=False)
+class BellmanState:
+    """A value and what it proves."""
+
+    step: int  # linear systems solved
+    horizon: float  # infinite once undiscounted
+    value: np.ndarray  # [n], reward
+    backed_up: np.ndarray  # TV, [n]
+    policy: np.ndarray  # pi_V, [n, A]
+    theta_bounds: tuple[float, float]  # on theta* of the undiscounted problem
+
+    @property
+    def width(self) -> float:
+        return self.theta_bounds[1] - self.theta_bounds[0]
+
+
+def solve_soft_bellman(
+    mdp: TabularMDP, beta: float, prior_policy: Any = None, tol: float = 1e-10, max_steps: int = 200
+) -> Solution:
+    """The optimal entropy-regularised policy of ``mdp``, with two-sided bounds on theta*.
+
+    Args:
+        beta: inverse temperature, 1/reward, > 0.
+        prior_policy: [S, A], entries > 0; None is uniform.
+        tol: width of the bounds to stop at, relative to the range of the rewards.
+        max_steps: linear systems at most.
+
+    Returns:
+        A Solution with ``value``, ``theta_bounds`` and ``gap``. Status REDUCIBLE where the states that the start
+        leads to do not form one recurrent class (the message names them), STAGNATED where rounding or a nearly
+        closed set of states ends progress above ``tol`` (the bounds hold all the same). States that the start does
+        not lead to keep the prior policy.
+
+    Raises:
+        InputError: beta, prior or tol out of range.
+    """
+    problem = Problem.of(mdp, beta, prior_policy)
+    checks.positive("tol", tol)
+    checks.at_least("max_steps", max_steps, 1)
+    ref = problem.regeneration_state()
+    if ref is None:
+        return reducible_solution(mdp, problem, prior_policy)
+    best = state = None
+    for state in iterate_soft_bellman(problem, ref, tol, max_steps):
+        if best is None or state.width < best.width:
+            best = state
+    assert state is not None
+    assert best is not None
+    if best.width <= tol * problem.reward_range:
+        status = Status.CONVERGED
+    else:
+        status = Status.STEP_LIMIT if state.step >= max_steps else Status.STAGNATED
+    return exact_solution(mdp, problem, best.value, status, state.step, best.theta_bounds, prior_policy)
+
+
+def certify(solution: Solution, mdp: TabularMDP, beta: float, prior_policy: Any = None) -> Solution:
+    """``solution``, learnt by whatever means, with the ``theta_bounds`` of ``mdp`` and its policy's own ``gap``.
+
+    Solves the model: the bounds are those of ``solve_soft_bellman``, the gap is their lower end on g* less J(policy),
+    so an upper bound that is as sharp as they are narrow.
+    """
+    problem = Problem.of(mdp, beta, prior_policy)
+    bounds = solve_soft_bellman(mdp, beta, prior_policy).theta_bounds
+    assert bounds is not None
+    policy = solution.policy.detach().cpu().numpy()[problem.states]
+    return replace(solution, theta_bounds=bounds, gap=policy_gap(problem, policy, bounds), beta=beta)
+
+
+def iterate_soft_bellman(problem: Problem, ref: int, tol: float, max_steps: int) -> Iterator[BellmanState]:
+    """Yield a state after each Newton step, until the bounds are within ``tol`` or progress ends."""
+    goal = tol * problem.reward_range
+    state = _state(problem, np.zeros(problem.n_states), 0, 0.0)
+    yield state
+    horizon, loose = FIRST_HORIZON, LOOSE
+    while state.width > goal and state.step < max_steps and horizon <= LAST_HORIZON:
+        discount = 1 - 1 / horizon
+        for once in range(50):
+            backed_up, policy = soft_backup(problem.action_value(discount * state.value), problem.prior, problem.beta)
+            error = backed_up - state.value
+            if state.step >= max_steps or (once and np.ptp(error) <= loose * problem.reward_range):
+                break
+            lu = DiscountedLU(problem.chain(policy), discount)
+            value = state.value + lu.solve(error)
+            # Where the process is after so many steps: a state to come back to.
+            ref = int(np.argmax(lu.occupancy(problem.start)))
+            state = _state(problem, value - value[ref], state.step + 1, horizon)
+            yield state
+            if state.width <= goal:
+                return
+        if state.width < NEAR * problem.reward_range or horizon > 1e6:
+            best, steps = state, state.step
+            for new in _undiscounted(problem, state, ref, goal, max_steps):
+                yield new
+                steps = new.step
+                best = new if new.width < best.width else best
+            state = replace(best, step=steps)
+            loose *= 0.1
+        horizon *= GROWTH
+
+
+def _undiscounted(
+    problem: Problem, state: BellmanState, ref: int, goal: float, max_steps: int
+) -> Iterator[BellmanState]:
+    """Newton steps from ``state`` until the bounds are within ``goal``, or have not halved in three steps."""
+    widths = [state.width]
+    while widths[-1] > goal and state.step < max_steps:
+        if len(widths) > 3 and min(widths[-3:]) > 0.5 * min(widths[:-3]):
+            return
+        try:
+            lu = RegenerativeLU.adapted(problem.chain(state.policy), ref)
+        except SingularChainError:
+            return
+        ref = lu.ref
+        value = state.value + lu.poisson(state.backed_up - state.value)[1]
+        if not np.isfinite(value).all():
+            return
+        state = _state(problem, value - value[ref], state.step + 1, np.inf)
+        widths.append(state.width)
+        yield state
+
+
+def _state(problem: Problem, value: np.ndarray, step: int, horizon: float) -> BellmanState:
+    backed_up, policy = soft_backup(problem.action_value(value), problem.prior, problem.beta)
+    return BellmanState(step, horizon, value, backed_up, policy, theta_bounds(value, backed_up, problem.reward))
