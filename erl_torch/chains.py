@@ -51,30 +51,34 @@ def likely_state(chain: sp.csr_array, steps: int = 256) -> int:
 
 
 class RegenerativeLU:
-    """Sparse LU of I - ``chain`` cut at ``ref``; ``chain`` is a row-stochastic CSR [S, S].
+    """Sparse LU of I - discount * ``chain``, cut at ``ref``; ``chain`` is a row-stochastic CSR [S, S].
 
-    Raises SingularChainError if ``ref`` is not reached from everywhere.
+    With discount 1, raises SingularChainError if ``ref`` is not reached from everywhere.
     """
 
-    def __init__(self, chain: sp.csr_array, ref: int) -> None:
+    def __init__(self, chain: sp.csr_array, ref: int, discount: float = 1.0) -> None:
         n = chain.shape[0]
-        self.chain, self.ref = chain, ref
+        self.ref, self.discount = ref, discount
+        self.chain = chain if discount == 1.0 else chain * discount
         first, last = chain.indptr[ref], chain.indptr[ref + 1]
         self._row = np.zeros(n)  # of ref, without ref itself
-        np.add.at(self._row, chain.indices[first:last], chain.data[first:last])
+        np.add.at(self._row, chain.indices[first:last], self.chain.data[first:last])
         self._row[ref] = 0.0
-        data = -chain.data
+        data = -self.chain.data
         data[chain.indices == ref] = 0.0
         data[first:last] = 0.0
         cut = sp.csc_array(sp.csr_array((data, chain.indices, chain.indptr), shape=(n, n)) + sp.eye_array(n))
         cut.eliminate_zeros()
         try:
-            self._lu = _m_matrix_lu(cut)
+            # No pivoting: an M-matrix needs none, and the fill stays what the ordering makes it.
+            self._lu = spla.splu(
+                cut, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+            )
         except RuntimeError as error:  # exactly singular
             raise SingularChainError(str(error)) from error
         ones = np.ones(n)
         ones[ref] = 0.0
-        self.hitting_time = self._lu.solve(ones)  # expected steps to ref
+        self.hitting_time = self._lu.solve(ones)  # expected (discounted) steps to ref
         if not (np.isfinite(self.hitting_time).all() and self.hitting_time.min() >= 0):
             raise SingularChainError(f"state {ref} is not reached from every state")
 
@@ -94,7 +98,10 @@ class RegenerativeLU:
         return cls(chain, likely)
 
     def poisson(self, c: np.ndarray) -> tuple[float, np.ndarray]:
-        """(gain, w) with w + gain = c + K w and w[ref] = 0."""
+        """(gain, w) with w + gain = c + discount K w and w[ref] = 0.
+
+        With x = c + discount K x, the discounted value, w = x - x[ref] and gain = (1 - discount) x[ref].
+        """
         gain, w = self._poisson(c)
         # One refinement: the first answer is a difference of large numbers where ref is far.
         more, dw = self._poisson(c + self.chain @ w - w - gain)
@@ -108,29 +115,7 @@ class RegenerativeLU:
         return float(gain), x - gain * self.hitting_time
 
     def stationary(self) -> np.ndarray:
-        """Stationary distribution [S]; states that ``ref`` does not lead to have 0."""
+        """Share of time in each state [S] from ``ref`` on, with discount 1 for ever: the stationary distribution."""
         d = np.maximum(self._lu.solve(self._row, "T"), 0.0)
         d[self.ref] = 1.0
         return np.asarray(d / d.sum())
-
-
-class DiscountedLU:
-    """Sparse LU of I - ``discount`` * ``chain``."""
-
-    def __init__(self, chain: sp.csr_array, discount: float) -> None:
-        matrix = sp.csc_array(sp.eye_array(chain.shape[0]) - discount * chain)
-        self._discount = discount
-        self._lu = _m_matrix_lu(matrix)
-
-    def solve(self, c: np.ndarray) -> np.ndarray:
-        """w with w = c + discount K w."""
-        return np.asarray(self._lu.solve(c))
-
-    def occupancy(self, start: np.ndarray) -> np.ndarray:
-        """Share of time in each state, from ``start`` [S], until an end that comes with 1 - discount a step."""
-        return np.asarray((1 - self._discount) * self._lu.solve(start, "T"))
-
-
-def _m_matrix_lu(matrix: sp.csc_array) -> spla.SuperLU:
-    """No pivoting: an M-matrix needs none, and the fill stays what the ordering makes it."""
-    return spla.splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})

@@ -24,7 +24,7 @@ from erl_torch import (
     solve_biasing,
     solve_soft_bellman,
 )
-from erl_torch.chains import DiscountedLU, RegenerativeLU, SingularChainError, classes, reachable_from
+from erl_torch.chains import RegenerativeLU, SingularChainError, classes, reachable_from
 from erl_torch.envs.windy_cliff import WindyCliffEnv
 from erl_torch.evaluation import induced_distribution, kl_per_state, objective, policy_chain, reward_per_step
 from erl_torch.solvers.problem import Problem, soft_backup, theta_bounds
@@ -400,8 +400,11 @@ def test_regeneration_solves_the_poisson_equation(seed):
     d = lu.stationary()
     np.testing.assert_allclose(d @ chain.toarray(), d, atol=1e-14)
     assert gain == pytest.approx(d @ c, abs=1e-13)
-    x = DiscountedLU(chain, 0.9).solve(c)
-    np.testing.assert_allclose(x, c + 0.9 * chain @ x, atol=1e-12)
+    # Discounted: w + (1 - discount) x[ref] with x = c + discount K x.
+    x = np.linalg.solve(np.eye(7) - 0.9 * chain.toarray(), c)
+    gain, w = RegenerativeLU(chain, 3, 0.9).poisson(c)
+    assert gain == pytest.approx(0.1 * x[3], abs=1e-12)
+    np.testing.assert_allclose(w, x - x[3], atol=1e-12)
 
 
 def test_regeneration_needs_a_state_that_is_reached():

@@ -112,6 +112,7 @@ def solve_log_perron(
         gain = backed_up - h
     best, best_bounds = h, bounds_of(gain)
     refused, before = 0, np.inf
+    lu: RegenerativeLU | None = None
     for step in range(max_steps + 1):
         spread = np.ptp(gain)
         rounding = 64 * np.finfo(np.float64).eps * (1 + np.abs(h).max() + np.abs(gain).max())
@@ -120,17 +121,18 @@ def solve_log_perron(
         if step == max_steps:
             break
         try:
-            lu = RegenerativeLU.adapted(chain, ref)
-            ref = lu.ref
-            _, dh = lu.poisson(gain)
-            new = h + dh
-            new -= new.max()
-            new_backed_up, new_chain = tilt(new)
+            new, (new_backed_up, new_chain) = _step(tilt, h, gain, lu) if lu else (h, (backed_up, chain))
             new_gain = new_backed_up - new
+            # The factors of an earlier step will do where they still gain three digits.
+            if lu is None or not np.ptp(new_gain) < 1e-3 * spread:
+                lu = RegenerativeLU.adapted(chain, ref)
+                ref = lu.ref
+                new, (new_backed_up, new_chain) = _step(tilt, h, gain, lu)
+                new_gain = new_backed_up - new
             if not np.isfinite(new_gain).all():
                 raise SingularChainError("not finite")
         except SingularChainError:
-            refused += 1
+            refused, lu = refused + 1, None
             if refused > 5:
                 return best, best_bounds, Status.STAGNATED, step
             for _ in range(200):
@@ -145,3 +147,11 @@ def solve_log_perron(
         if np.ptp(gain) < best_bounds[1] - best_bounds[0]:
             best, best_bounds = h, bounds_of(gain)
     return best, best_bounds, Status.STEP_LIMIT, max_steps
+
+
+def _step(
+    tilt: Tilt, h: np.ndarray, gain: np.ndarray, lu: RegenerativeLU
+) -> tuple[np.ndarray, tuple[np.ndarray, sp.csr_array]]:
+    new = h + lu.poisson(gain)[1]
+    new -= new.max()
+    return new, tilt(new)

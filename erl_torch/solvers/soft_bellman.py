@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from erl_torch import checks
-from erl_torch.chains import DiscountedLU, RegenerativeLU, SingularChainError
+from erl_torch.chains import RegenerativeLU, SingularChainError
 from erl_torch.mdp import TabularMDP
 from erl_torch.solution import Solution, Status
 from erl_torch.solvers.problem import Problem, soft_backup, theta_bounds
@@ -108,7 +108,7 @@ def iterate_soft_bellman(problem: Problem, ref: int, tol: float, max_steps: int)
     goal = tol * problem.reward_range
     state = _state(problem, np.zeros(problem.n_states), 0, 0.0)
     yield state
-    horizon, loose = FIRST_HORIZON, LOOSE
+    horizon, loose, home = FIRST_HORIZON, LOOSE, ref
     while state.width > goal and state.step < max_steps and horizon <= LAST_HORIZON:
         discount = 1 - 1 / horizon
         for once in range(50):
@@ -116,11 +116,10 @@ def iterate_soft_bellman(problem: Problem, ref: int, tol: float, max_steps: int)
             error = backed_up - state.value
             if state.step >= max_steps or (once and np.ptp(error) <= loose * problem.reward_range):
                 break
-            lu = DiscountedLU(problem.chain(policy), discount)
-            value = state.value + lu.solve(error)
-            # Where the process is after so many steps: a state to come back to.
-            ref = int(np.argmax(lu.occupancy(problem.start)))
-            state = _state(problem, value - value[ref], state.step + 1, horizon)
+            lu = RegenerativeLU(problem.chain(policy), home, discount)
+            state = _state(problem, state.value + lu.poisson(error)[1], state.step + 1, horizon)
+            # Where the process spends its time within the horizon: a state to come back to.
+            ref = int(np.argmax(lu.stationary()))
             yield state
             if state.width <= goal:
                 return
@@ -140,20 +139,29 @@ def _undiscounted(
 ) -> Iterator[BellmanState]:
     """Newton steps from ``state`` until the bounds are within ``goal``, or have not halved in three steps."""
     widths = [state.width]
+    lu: RegenerativeLU | None = None
     while widths[-1] > goal and state.step < max_steps:
         if len(widths) > 3 and min(widths[-3:]) > 0.5 * min(widths[:-3]):
             return
-        try:
-            lu = RegenerativeLU.adapted(problem.chain(state.policy), ref)
-        except SingularChainError:
+        new = _newton(problem, state, lu) if lu else None
+        # The factors of an earlier step will do where they still gain two digits.
+        if new is None or not new.width < 0.01 * state.width:
+            try:
+                lu = RegenerativeLU.adapted(problem.chain(state.policy), ref)
+            except SingularChainError:
+                return
+            ref = lu.ref
+            new = _newton(problem, state, lu)
+        if not np.isfinite(new.width):
             return
-        ref = lu.ref
-        value = state.value + lu.poisson(state.backed_up - state.value)[1]
-        if not np.isfinite(value).all():
-            return
-        state = _state(problem, value - value[ref], state.step + 1, np.inf)
+        state = new
         widths.append(state.width)
         yield state
+
+
+def _newton(problem: Problem, state: BellmanState, lu: RegenerativeLU) -> BellmanState:
+    value = state.value + lu.poisson(state.backed_up - state.value)[1]
+    return _state(problem, value - value[lu.ref], state.step + 1, np.inf)
 
 
 def _state(problem: Problem, value: np.ndarray, step: int, horizon: float) -> BellmanState:
