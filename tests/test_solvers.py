@@ -280,6 +280,24 @@ def test_transient_states_are_solved_by_soft_bellman_and_named_by_biasing():
     assert solve_biasing(mdp, 2.0).status is Status.REDUCIBLE
 
 
+@pytest.mark.parametrize("beta", [0.5, 1.0, 3.0, 10.0])
+def test_a_transient_state_that_is_better_off_staying(beta):
+    """0 may stay (reward 0, KL log 2) or fall into 1 (reward -1 for ever): theta* = min(1, log(2)/beta)."""
+    mdp = TabularMDP([[[1, 0], [0, 1]], [[0, 1], [0, 1]]], [[0.0, 0.0], [-1.0, -1.0]], [1, 0])
+    solution = solve_soft_bellman(mdp, beta)
+    best = min(1.0, np.log(2) / beta)
+    assert solution.theta_bounds[0] <= best + 1e-9
+    assert best <= solution.theta_bounds[1]
+    if beta < np.log(2):
+        assert solution.status is Status.CONVERGED
+    else:  # two gains: bounds cannot close; the policy is right, and the states are named
+        assert solution.status is Status.REDUCIBLE
+        assert "[1]" in solution.message
+        assert "[0]" in solution.message
+        assert solution.policy[0, 0] > 1 - 1e-12
+        assert solution.theta_bounds[0] == pytest.approx(best, abs=1e-9)
+
+
 def test_unreachable_states_keep_the_prior():
     p = np.zeros((4, 2, 4))
     p[0, :, 1] = p[1, :, 0] = p[2, :, 0] = p[3, :, 3] = 1.0

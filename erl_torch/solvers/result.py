@@ -85,12 +85,18 @@ def policy_gap(problem: Problem, policy: np.ndarray, bounds: tuple[float, float]
     return float(max(-bounds[0] - gain, 0.0) + slack)
 
 
-def reducible_solution(mdp: TabularMDP, problem: Problem, prior_policy: Any, n_steps: int = 0) -> Solution:
-    """The prior policy, the bounds it proves, and a message that names the classes."""
-    label, closed = problem.classes()
+def reducible_solution(mdp: TabularMDP, problem: Problem, prior_policy: Any) -> Solution:
+    """The best policy and bounds that V = 0 proves, and a message that names the classes."""
     value = np.zeros(problem.n_states)
     backed_up, _ = soft_backup(problem.action_value(value), problem.prior, problem.beta)
     bounds = theta_bounds(value, backed_up, problem.reward)
+    message = explain_classes(problem)
+    return exact_solution(mdp, problem, value, Status.REDUCIBLE, 0, bounds, prior_policy, message)
+
+
+def explain_classes(problem: Problem) -> str:
+    """Why the states that the start leads to are no single recurrent class, and what to do."""
+    label, closed = problem.classes()
 
     def name(c: int) -> str:
         inside = problem.states[label == c]
@@ -98,16 +104,15 @@ def reducible_solution(mdp: TabularMDP, problem: Problem, prior_policy: Any, n_s
 
     ends = [name(c) for c in np.flatnonzero(closed)[:5]]
     if closed.sum() > 1:
-        message = (
+        return (
             f"{closed.sum()} closed sets of states, {', '.join(ends)}: let the process restart from them, "
             "or solve each apart"
         )
-    else:
-        message = (
-            f"states outside the closed set {ends[0]} are better off never to reach it: solve them apart, or "
-            "raise what the closed set earns"
-        )
-    return exact_solution(mdp, problem, value, Status.REDUCIBLE, n_steps, bounds, prior_policy, message)
+    others = [name(c) for c in np.flatnonzero(~closed)[:5]]
+    return (
+        f"once in the closed set {ends[0]}, the process never returns to {', '.join(others)}: let it restart, "
+        "or solve those states apart (they may be better off never to leave)"
+    )
 
 
 def spread(problem: Problem, table: np.ndarray, elsewhere: np.ndarray) -> torch.Tensor:

@@ -26,7 +26,7 @@ from erl_torch.chains import RegenerativeLU, SingularChainError
 from erl_torch.mdp import TabularMDP
 from erl_torch.solution import Solution, Status
 from erl_torch.solvers.problem import Problem, soft_backup, theta_bounds
-from erl_torch.solvers.result import exact_solution, policy_gap, reducible_solution
+from erl_torch.solvers.result import exact_solution, explain_classes, policy_gap, reducible_solution
 
 FIRST_HORIZON = 30.0  # steps
 GROWTH = 30.0
@@ -87,7 +87,10 @@ def solve_soft_bellman(
         status = Status.CONVERGED
     else:
         status = Status.STEP_LIMIT if state.step >= max_steps else Status.STAGNATED
-    return exact_solution(mdp, problem, best.value, status, state.step, best.theta_bounds, prior_policy)
+    message = ""
+    if status is Status.STAGNATED and len(problem.classes()[1]) > 1:
+        status, message = Status.REDUCIBLE, explain_classes(problem)
+    return exact_solution(mdp, problem, best.value, status, state.step, best.theta_bounds, prior_policy, message)
 
 
 def certify(solution: Solution, mdp: TabularMDP, beta: float, prior_policy: Any = None) -> Solution:
