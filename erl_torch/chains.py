@@ -97,12 +97,14 @@ class RegenerativeLU:
                 raise
         return cls(chain, likely)
 
-    def poisson(self, c: np.ndarray) -> tuple[float, np.ndarray]:
+    def poisson(self, c: np.ndarray, refine: bool = True) -> tuple[float, np.ndarray]:
         """(gain, w) with w + gain = c + discount K w and w[ref] = 0.
 
         With x = c + discount K x, the discounted value, w = x - x[ref] and gain = (1 - discount) x[ref].
         """
         gain, w = self._poisson(c)
+        if not refine:
+            return gain, w
         # One refinement: the first answer is a difference of large numbers where ref is far.
         more, dw = self._poisson(c + self.chain @ w - w - gain)
         return gain + more, w + dw

@@ -57,7 +57,7 @@ def exact_solution(
         value=spread(problem, value, np.zeros(mdp.n_states)),
         action_value=spread(problem, action_value, np.zeros_like(prior)),
         theta_bounds=bounds,
-        gap=policy_gap(problem, policy, bounds),
+        gap=bounds[1] - bounds[0],  # pi_V: J is not below the lower end
         k=k,
     )
 

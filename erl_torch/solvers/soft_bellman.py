@@ -28,11 +28,11 @@ from erl_torch.solution import Solution, Status
 from erl_torch.solvers.problem import Problem, soft_backup, theta_bounds
 from erl_torch.solvers.result import exact_solution, explain_classes, policy_gap, reducible_solution
 
-FIRST_HORIZON = 30.0  # steps
-GROWTH = 30.0
+FIRST_HORIZON = 300.0  # steps
+GROWTH = 100.0
 LAST_HORIZON = 1e13
-LOOSE = 0.03  # residual, relative to the reward range, at which the horizon grows
-NEAR = 0.1  # width of the undiscounted bounds, relative to the reward range, at which discounting may end
+LOOSE = 0.1  # residual, relative to the reward range, at which the horizon grows
+NEAR = 0.3  # width of the undiscounted bounds, relative to the reward range, at which discounting may end
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +120,7 @@ def iterate_soft_bellman(problem: Problem, ref: int, tol: float, max_steps: int)
             if state.step >= max_steps or (once and np.ptp(error) <= loose * problem.reward_range):
                 break
             lu = RegenerativeLU(problem.chain(policy), home, discount)
-            state = _state(problem, state.value + lu.poisson(error)[1], state.step + 1, horizon)
+            state = _state(problem, state.value + lu.poisson(error, refine=False)[1], state.step + 1, horizon)
             # Where the process spends its time within the horizon: a state to come back to.
             ref = int(np.argmax(lu.stationary()))
             yield state
