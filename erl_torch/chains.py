@@ -42,7 +42,7 @@ def classes(chain: sp.csr_array) -> tuple[np.ndarray, np.ndarray]:
     return label, closed
 
 
-def likely_state(chain: sp.csr_array, steps: int = 256) -> int:
+def likely_state(chain: sp.csr_array, steps: int = 64) -> int:
     """A state where the chain spends much time, after ``steps`` lazy steps from everywhere."""
     share = np.full(chain.shape[0], 1.0 / chain.shape[0])
     for _ in range(steps):

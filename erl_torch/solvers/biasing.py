@@ -121,7 +121,7 @@ def iterate_biasing(
     shift_before = np.inf
     for k in range(max_steps):
         at = known if k == 0 else problem
-        h, bounds, status, newton_steps = _eigenvector(at, value, ref)
+        h, bounds, status, newton_steps = _eigenvector(at, value)
         log_psi = -beta * value
         # The policy and the dynamics that are optimal in the biased problem.
         log_mean, _, tilted = _tilt(at, h)
@@ -172,7 +172,7 @@ def _tilt(problem: Problem, h: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.n
     return log_mean, kl, tilted
 
 
-def _eigenvector(problem: Problem, value: np.ndarray, ref: int) -> tuple[np.ndarray, tuple[float, float], Status, int]:
+def _eigenvector(problem: Problem, value: np.ndarray) -> tuple[np.ndarray, tuple[float, float], Status, int]:
     """Right eigenvector of M_V as its logarithm, with bounds on beta G(V)."""
     log_weight = problem.beta * (problem.action_value(value) - value[:, None])
 
@@ -181,7 +181,7 @@ def _eigenvector(problem: Problem, value: np.ndarray, ref: int) -> tuple[np.ndar
         backed_up, choice = soft_backup(log_weight + log_mean.reshape(log_weight.shape), problem.prior, 1.0)
         return backed_up, problem.chain(choice, tilted)
 
-    return solve_log_perron(tilt, np.zeros(problem.n_states), ref, 1e-13, 60)
+    return solve_log_perron(tilt, np.zeros(problem.n_states), 1e-13, 60)
 
 
 def _kl_to(problem: Problem, at: Problem, h: np.ndarray, tilted: np.ndarray) -> np.ndarray:

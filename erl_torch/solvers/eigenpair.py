@@ -18,7 +18,7 @@ import scipy.sparse as sp
 import torch
 
 from erl_torch import kernels
-from erl_torch.chains import RegenerativeLU, SingularChainError, classes
+from erl_torch.chains import RegenerativeLU, SingularChainError, classes, likely_state
 from erl_torch.checks import InputError
 from erl_torch.solution import Status
 
@@ -86,15 +86,15 @@ def perron(matrix: Any, rtol: float = 1e-13, max_steps: int = 60) -> PerronPair:
     y = np.ones(n)
     kernels.lazy_power(m.indptr, m.indices, m.data, y, POWER_STEPS)
     start = np.log(y) if np.isfinite(y).all() and y.min() > 1e-280 else np.zeros(n)
-    h, bounds, status, n_steps = solve_log_perron(tilt, start, int(np.argmax(start)), rtol, max_steps, 0)
+    h, bounds, status, n_steps = solve_log_perron(tilt, start, rtol, max_steps, 0)
     h -= h.max()
     return PerronPair(0.5 * sum(bounds), torch.from_numpy(h), bounds, status, n_steps)
 
 
 def solve_log_perron(
-    tilt: Tilt, h: np.ndarray, ref: int, rtol: float, max_steps: int, power_steps: int = LOG_POWER_STEPS
+    tilt: Tilt, h: np.ndarray, rtol: float, max_steps: int, power_steps: int = LOG_POWER_STEPS
 ) -> tuple[np.ndarray, tuple[float, float], Status, int]:
-    """(h, bounds on log rho, status, Newton steps) of M exp(h) = rho exp(h); ``ref`` any state of the chain."""
+    """(h, bounds on log rho, status, Newton steps) of M exp(h) = rho exp(h)."""
 
     def bounds_of(gain: np.ndarray) -> tuple[float, float]:
         slack = 8 * np.finfo(np.float64).eps * (1 + np.abs(h).max() + np.abs(gain).max())
@@ -110,6 +110,7 @@ def solve_log_perron(
         h -= h.max()
         backed_up, chain = tilt(h)
         gain = backed_up - h
+    ref = likely_state(chain)
     best, best_bounds = h, bounds_of(gain)
     refused, before = 0, np.inf
     lu: RegenerativeLU | None = None
@@ -123,8 +124,8 @@ def solve_log_perron(
         try:
             new, (new_backed_up, new_chain) = _step(tilt, h, gain, lu) if lu else (h, (backed_up, chain))
             new_gain = new_backed_up - new
-            # The factors of an earlier step will do where they still gain three digits.
-            if lu is None or not np.ptp(new_gain) < 1e-3 * spread:
+            # The factors of an earlier step will do where they still gain two digits.
+            if lu is None or not np.ptp(new_gain) < 1e-2 * spread:
                 lu = RegenerativeLU.adapted(chain, ref)
                 ref = lu.ref
                 new, (new_backed_up, new_chain) = _step(tilt, h, gain, lu)
