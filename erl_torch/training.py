@@ -193,8 +193,9 @@ class _Solving:
         return f"Newton step {state.step}"
 
     def tags(self, state: ExactState, measured: Evaluation) -> dict[str, float]:
-        known = {f"exact/{name}": value for name, value in state.metrics().items() if np.isfinite(value)}
-        return known | _evaluation_tags(measured)
+        # Nothing is proven at step 0; TensorBoard's band chart wants the same steps in all three tags.
+        known = state.metrics().items() if state.step else ()
+        return {f"exact/{name}": value for name, value in known} | _evaluation_tags(measured)
 
     def postfix(self, state: ExactState) -> str:
         return f"theta {state.theta:.6f} in [{state.theta_bounds[0]:.6f}, {state.theta_bounds[1]:.6f}]"
@@ -356,7 +357,7 @@ def _result(
         "status": solution.status.name.lower(),
         "message": solution.message,
         "theta": solution.theta,
-        "rho": solution.rho,
+        "rho": solution.rho if np.isfinite(solution.rho) else None,  # exp(-beta theta) can overflow; theta tells
         "reward_bias_max": solution.reward_bias_max,
         "reward_per_step": last.reward_per_step,
         "objective": last.objective,
@@ -392,7 +393,7 @@ def _summary(
     logs = "runs" if directory.parts[0] == "runs" else directory
     done = result[f"n_{unit}"]
     rows = [
-        ("theta", f"{start.theta:12.5f}", f"{result['theta']:12.5f}"),
+        ("theta", f"{start.theta:12.5f}" if isinstance(start, S1State) else " " * 12, f"{result['theta']:12.5f}"),
         *([("rho", f"{start.rho:12.4e}", f"{result['rho']:12.4e}")] if isinstance(start, S1State) else []),
         ("reward per step", f"{first.reward_per_step:12.5f}", f"{last.reward_per_step:12.5f}"),
         ("objective", f"{first.objective:12.5f}", f"{last.objective:12.5f}"),

@@ -156,7 +156,7 @@ def test_exact_learner(tmp_path, method):
     low, theta, high = (
         [e.value for e in reader.Scalars(f"exact/{n}")] for n in ("theta_lower", "theta", "theta_upper")
     )
-    assert len(low) == len(high) == result["n_iterations"]
+    assert len(low) == len(theta) == len(high) == result["n_iterations"]
     assert all(a <= b + 1e-6 for a, b in zip(low, high, strict=True))
     assert theta[-1] == pytest.approx(1.0101363366, abs=1e-6)
     assert reader.Scalars("exact/kl_max")[-1].value < 1e-6
@@ -165,6 +165,15 @@ def test_exact_learner(tmp_path, method):
     assert all(f"`{tag}`" in text for tag in reader.Tags()["scalars"])
     history = Solution.load(tmp_path / "solution.npz").history
     assert len(history["theta"]) == result["n_iterations"]
+
+
+def test_exact_learner_at_low_temperature_with_positive_rewards(tmp_path):
+    """rho = exp(beta 12.5...) overflows; the answer does not."""
+    cfg = composed("learner=exact", "learner.method=soft_bellman", "learner.beta=1e4", "env.trap_reward=50")
+    result = train(cfg, tmp_path)
+    assert result["status"] == "converged"
+    assert result["rho"] is None
+    assert result["objective"] == pytest.approx(-result["theta"], abs=1e-6)
 
 
 def test_exact_learner_needs_a_model(tmp_path):
