@@ -357,7 +357,7 @@ def _result(
         "status": solution.status.name.lower(),
         "message": solution.message,
         "theta": solution.theta,
-        "rho": solution.rho if np.isfinite(solution.rho) else None,  # exp(-beta theta) can overflow; theta tells
+        "rho": solution.rho if 0 < solution.rho < np.inf else None,  # beyond double precision: theta tells
         "reward_bias_max": solution.reward_bias_max,
         "reward_per_step": last.reward_per_step,
         "objective": last.objective,

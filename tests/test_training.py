@@ -168,7 +168,7 @@ def test_exact_learner(tmp_path, method):
 
 
 def test_exact_learner_at_low_temperature_with_positive_rewards(tmp_path):
-    """rho = exp(beta 12.5...) overflows; the answer does not."""
+    """rho = exp(-beta (theta + Delta)) is beyond double precision; the answer is not."""
     cfg = composed("learner=exact", "learner.method=soft_bellman", "learner.beta=1e4", "env.trap_reward=50")
     result = train(cfg, tmp_path)
     assert result["status"] == "converged"
