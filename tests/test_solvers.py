@@ -27,6 +27,7 @@ from erl_torch import (
 from erl_torch.chains import RegenerativeLU, SingularChainError, classes, reachable_from
 from erl_torch.envs.windy_cliff import WindyCliffEnv
 from erl_torch.evaluation import induced_distribution, kl_per_state, objective, policy_chain, reward_per_step
+from erl_torch.learners import Exact
 from erl_torch.solvers.problem import Problem, soft_backup, theta_bounds
 
 CLIFF = WindyCliffEnv().mdp
@@ -208,6 +209,29 @@ def test_any_value_carries_a_certificate(problem, beta, spread):
     assert -optimum.theta - j == pytest.approx(d @ kl_per_state(policy, optimum.policy.numpy()) / beta, abs=1e-9)
     certified = certify(replace(optimum, policy=torch.from_numpy(policy)), mdp, beta, prior)
     assert certified.gap == pytest.approx(-optimum.theta - j, abs=1e-9)
+
+
+@pytest.mark.parametrize("max_steps", [1, 2, 3])
+def test_the_gap_is_that_of_the_policy_returned(max_steps):
+    """Also where the best bounds were proven by an earlier iteration."""
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        mdp, prior = random_mdp(rng, 5, 3), random_policy(rng, 5, 3)
+        best = -solve_soft_bellman(mdp, 20.0, prior).theta
+        for solve in (solve_biasing, solve_soft_bellman):
+            solution = solve(mdp, 20.0, prior, max_steps=max_steps)
+            assert best - objective(mdp, solution.policy.numpy(), prior, 20.0) <= solution.gap + 1e-10
+
+
+@pytest.mark.parametrize("method", ["biasing", "soft_bellman"])
+def test_exact_learner_with_nothing_to_iterate(method):
+    """One state: V = 0 is the solution, before any step."""
+    mdp = TabularMDP([[1.0], [1.0]], [[-1.0, -3.0]])
+    learner = Exact(beta=1.0, method=method)
+    states = list(learner.iterate(mdp))
+    solution = learner.solution(mdp, states[-1], [s.metrics() for s in states], False)
+    assert solution.status is Status.CONVERGED
+    assert solution.theta == pytest.approx(-np.log(0.5 * (np.exp(-1) + np.exp(-3))), abs=1e-10)
 
 
 def test_learnt_solutions_are_certified():

@@ -17,7 +17,7 @@ from erl_torch.mdp import TabularMDP, check_policy
 from erl_torch.solution import Solution, Status
 from erl_torch.solvers.biasing import KL_TOLERANCE, BiasingState, iterate_biasing, solve_biasing
 from erl_torch.solvers.problem import Problem
-from erl_torch.solvers.result import bias, exact_solution, reducible_solution, spread
+from erl_torch.solvers.result import bias, exact_solution, how_it_ended, reducible_solution, spread
 from erl_torch.solvers.soft_bellman import BellmanState, iterate_soft_bellman, solve_soft_bellman
 
 
@@ -109,7 +109,7 @@ class Exact:
 
         if self.method == "soft_bellman":
             for newton in iterate_soft_bellman(problem, ref, self.tol, self.max_steps):
-                if newton.step:
+                if newton.step or newton.width <= self.tol * problem.reward_range:
                     yield full(newton.step, newton, 0.5 * sum(newton.theta_bounds), 0.0)
             return
         for state in iterate_biasing(mdp, self.beta, self.prior_policy, max_steps=self.max_steps):
@@ -120,24 +120,19 @@ class Exact:
     def solution(self, mdp: TabularMDP, state: ExactState, history: list[dict[str, float]], stopped: bool) -> Solution:
         """The solution that ``state`` stands for, with the record of the iterations."""
         problem = Problem.of(mdp, self.beta, self.prior_policy)
-        if state.step == 0:
+        if not len(state.value):  # no iteration could be made
             return reducible_solution(mdp, problem, self.prior_policy)
         below = [i for i, row in enumerate(history) if row["kl_max"] < KL_TOLERANCE]
-        width = state.theta_bounds[1] - state.theta_bounds[0]
-        if stopped:
-            status = Status.STOPPED
-        elif width <= self.tol * problem.reward_range:
-            status = Status.CONVERGED
-        else:
-            status = Status.STEP_LIMIT if state.step >= self.max_steps else Status.STAGNATED
+        status, message = how_it_ended(problem, state.theta_bounds, self.tol, state.step, self.max_steps)
         solution = exact_solution(
             mdp,
             problem,
             state.value,
-            status,
+            Status.STOPPED if stopped else status,
             state.step,
             state.theta_bounds,
             self.prior_policy,
+            message,
             k=below[0] if below and self.method == "biasing" else None,
         )
         return replace(solution, history={name: np.array([row[name] for row in history]) for name in history[0]})

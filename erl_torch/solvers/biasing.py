@@ -26,13 +26,13 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from erl_torch import checks, kernels
+from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.mdp import TabularMDP
 from erl_torch.solution import Solution, Status
 from erl_torch.solvers.eigenpair import solve_log_perron
 from erl_torch.solvers.problem import Problem, soft_backup, theta_bounds
-from erl_torch.solvers.result import bias, exact_solution, reducible_solution
+from erl_torch.solvers.result import bias, exact_solution, how_it_ended, reducible_solution
 
 KL_TOLERANCE = 1e-6
 
@@ -82,21 +82,20 @@ def solve_biasing(
     checks.one_of("stop", stop, ("certificate", "kl"))
     checks.positive("tol", tol)
     problem = _problem(mdp, beta, prior_policy, target)
-    if len(problem.classes()[1]) > 1:
+    if len(problem.classes[1]) > 1:
         return reducible_solution(target or mdp, problem, prior_policy)
     k: int | None = None
     state: BiasingState | None = None
-    status = Status.STEP_LIMIT
     for state in iterate_biasing(mdp, beta, prior_policy, target, max_steps):
         if k is None and state.kl.max() < KL_TOLERANCE:
             k = state.k
         width = state.theta_bounds[1] - state.theta_bounds[0]
         if width <= tol * problem.reward_range or (stop == "kl" and k is not None):
-            status = Status.CONVERGED
             break
     assert state is not None
-    if status is not Status.CONVERGED and state.k + 1 < max_steps:
-        status = Status.STAGNATED  # the iteration ended of itself
+    status, _ = how_it_ended(problem, state.theta_bounds, tol, state.k + 1, max_steps)
+    if stop == "kl" and k is not None:
+        status = Status.CONVERGED
     return exact_solution(
         target or mdp, problem, state.value, status, state.k + 1, state.theta_bounds, prior_policy, k=k
     )
@@ -113,7 +112,7 @@ def iterate_biasing(
     problem = _problem(mdp, beta, prior_policy, target)
     checks.at_least("max_steps", max_steps, 1)
     ref = problem.regeneration_state()
-    if ref is None or len(problem.classes()[1]) > 1:
+    if ref is None or len(problem.classes[1]) > 1:
         return
     known = Problem.of(mdp, beta, prior_policy) if target is not None else problem
     value = np.zeros(problem.n_states)
@@ -124,10 +123,11 @@ def iterate_biasing(
         h, bounds, status, newton_steps = _eigenvector(at, value)
         log_psi = -beta * value
         # The policy and the dynamics that are optimal in the biased problem.
-        log_mean, _, tilted = _tilt(at, h)
+        log_mean, kl, tilted = at.tilt(h)
         q = at.action_value(value) + log_mean.reshape(at.reward.shape) / beta
         policy = soft_backup(q, at.prior, beta)[1]
-        kl = _kl_to(problem, at, h, tilted)
+        if at is not problem:
+            kl = _kl_to(problem, at, tilted)
         value = value + h / beta
         value -= value[ref]
         backed_up, _ = soft_backup(problem.action_value(value), problem.prior, beta)
@@ -141,7 +141,7 @@ def iterate_biasing(
             reward_bias=bias(problem, log_psi),
             theta=-0.5 * sum(bounds) / beta,
             policy=policy,
-            kl=kl,
+            kl=kl.reshape(at.reward.shape),
             value=value,
             theta_bounds=(lower, upper),
             status=status,
@@ -164,34 +164,23 @@ def _problem(mdp: TabularMDP, beta: float, prior_policy: Any, target: TabularMDP
     return problem
 
 
-def _tilt(problem: Problem, h: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(log <exp h> [n*A], KL(tilted || p) [n*A], tilted probabilities as CSR data)."""
-    p, n = problem.transition, problem.reward.size
-    log_mean, kl, tilted = np.empty(n), np.empty(n), np.empty(p.nnz)
-    kernels.tilt_rows(p.indptr, p.indices, p.data, h, log_mean, kl, tilted)
-    return log_mean, kl, tilted
-
-
 def _eigenvector(problem: Problem, value: np.ndarray) -> tuple[np.ndarray, tuple[float, float], Status, int]:
     """Right eigenvector of M_V as its logarithm, with bounds on beta G(V)."""
     log_weight = problem.beta * (problem.action_value(value) - value[:, None])
 
     def tilt(h: np.ndarray) -> tuple[np.ndarray, sp.csr_array]:
-        log_mean, _, tilted = _tilt(problem, h)
+        log_mean, _, tilted = problem.tilt(h)
         backed_up, choice = soft_backup(log_weight + log_mean.reshape(log_weight.shape), problem.prior, 1.0)
         return backed_up, problem.chain(choice, tilted)
 
     return solve_log_perron(tilt, np.zeros(problem.n_states), 1e-13, 60)
 
 
-def _kl_to(problem: Problem, at: Problem, h: np.ndarray, tilted: np.ndarray) -> np.ndarray:
-    """KL(optimal dynamics || target dynamics), [n, A]; infinite where the target lacks a transition."""
-    if at is problem:
-        return _tilt(at, h)[1].reshape(at.reward.shape)
+def _kl_to(problem: Problem, at: Problem, tilted: np.ndarray) -> np.ndarray:
+    """KL(optimal dynamics || dynamics of ``problem``), [n*A]; infinite where these lack a transition."""
     p = at.transition
-    optimal = sp.csr_array((tilted, p.indices, p.indptr), shape=p.shape)
     rows = np.repeat(np.arange(p.shape[0]), np.diff(p.indptr))
     wanted = np.asarray(problem.transition[rows, p.indices]).ravel()
     with np.errstate(divide="ignore", invalid="ignore"):
-        terms = np.where(optimal.data > 0, optimal.data * np.log(optimal.data / wanted), 0.0)
-    return np.add.reduceat(terms, p.indptr[:-1]).reshape(at.reward.shape)
+        terms = np.where(tilted > 0, tilted * np.log(tilted / wanted), 0.0)
+    return np.asarray(np.add.reduceat(terms, p.indptr[:-1]))

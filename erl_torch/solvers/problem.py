@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from erl_torch import checks
+from erl_torch import checks, kernels
 from erl_torch.chains import classes, reachable_from
 from erl_torch.checks import InputError
 from erl_torch.mdp import TabularMDP, check_policy
@@ -67,6 +67,7 @@ class Problem:
     def _pair_of_entry(self) -> np.ndarray:
         return np.repeat(np.arange(self.reward.size), np.diff(self.transition.indptr))
 
+    @cached_property
     def classes(self) -> tuple[np.ndarray, np.ndarray]:
         """(label, closed) of the classes of states under policies with full support."""
         return classes(state_graph(self.transition, self.n_actions))
@@ -85,9 +86,16 @@ class Problem:
         chain.sum_duplicates()
         return chain
 
+    def tilt(self, h: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(log <exp h> [n*A], KL(tilted || p) [n*A], p exp(h)/<exp h> as CSR data)."""
+        p, n = self.transition, self.reward.size
+        log_mean, kl, tilted = np.empty(n), np.empty(n), np.empty(p.nnz)
+        kernels.tilt_rows(p.indptr, p.indices, p.data, h, log_mean, kl, tilted)
+        return log_mean, kl, tilted
+
     def regeneration_state(self) -> int | None:
         """A likely start in the only closed class, or None if there are several."""
-        label, closed = self.classes()
+        label, closed = self.classes
         if closed.sum() != 1:
             return None
         inside = np.flatnonzero(label == np.flatnonzero(closed)[0])

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from erl_torch import kernels
 from erl_torch.chains import RegenerativeLU, SingularChainError
 from erl_torch.evaluation import kl_per_state
 from erl_torch.mdp import TabularMDP, check_policy
@@ -31,6 +30,8 @@ def exact_solution(
     q = problem.action_value(value)
     backed_up, policy = soft_backup(q, problem.prior, beta)
     theta = 0.5 * (bounds[0] + bounds[1])
+    # J(pi_V) is not below the lower end that V itself proves; the bounds may come from another V.
+    gap = theta_bounds(value, backed_up, problem.reward)[1] - bounds[0]
     # log u = beta V + log(pi/prior), so Q = log(u)/beta = V + q - TV.
     action_value = value[:, None] + q - backed_up[:, None]
     shift = max(action_value.max(), value.max())
@@ -57,17 +58,14 @@ def exact_solution(
         value=spread(problem, value, np.zeros(mdp.n_states)),
         action_value=spread(problem, action_value, np.zeros_like(prior)),
         theta_bounds=bounds,
-        gap=bounds[1] - bounds[0],  # pi_V: J is not below the lower end
+        gap=gap,
         k=k,
     )
 
 
 def bias(problem: Problem, log_psi: np.ndarray) -> np.ndarray:
     """delta(s,a) = (log <psi> - <log psi>)/beta of equation (9), [n, A], reward."""
-    p, n = problem.transition, problem.reward.size
-    log_mean, kl, tilted = np.empty(n), np.empty(n), np.empty(p.nnz)
-    kernels.tilt_rows(p.indptr, p.indices, p.data, log_psi, log_mean, kl, tilted)
-    delta = np.maximum(log_mean - p @ log_psi, 0.0) / problem.beta
+    delta = np.maximum(problem.tilt(log_psi)[0] - problem.transition @ log_psi, 0.0) / problem.beta
     return np.asarray(delta.reshape(problem.reward.shape))
 
 
@@ -94,9 +92,22 @@ def reducible_solution(mdp: TabularMDP, problem: Problem, prior_policy: Any) -> 
     return exact_solution(mdp, problem, value, Status.REDUCIBLE, 0, bounds, prior_policy, message)
 
 
+def how_it_ended(
+    problem: Problem, bounds: tuple[float, float], tol: float, steps: int, max_steps: int
+) -> tuple[Status, str]:
+    """(status, message) of an iteration that has stopped with these bounds on theta*."""
+    if bounds[1] - bounds[0] <= tol * problem.reward_range:
+        return Status.CONVERGED, ""
+    if steps >= max_steps:
+        return Status.STEP_LIMIT, ""
+    if len(problem.classes[1]) > 1:
+        return Status.REDUCIBLE, explain_classes(problem)
+    return Status.STAGNATED, ""
+
+
 def explain_classes(problem: Problem) -> str:
     """Why the states that the start leads to are no single recurrent class, and what to do."""
-    label, closed = problem.classes()
+    label, closed = problem.classes
 
     def name(c: int) -> str:
         inside = problem.states[label == c]

@@ -24,9 +24,9 @@ import numpy as np
 from erl_torch import checks
 from erl_torch.chains import RegenerativeLU, SingularChainError
 from erl_torch.mdp import TabularMDP
-from erl_torch.solution import Solution, Status
+from erl_torch.solution import Solution
 from erl_torch.solvers.problem import Problem, soft_backup, theta_bounds
-from erl_torch.solvers.result import exact_solution, explain_classes, policy_gap, reducible_solution
+from erl_torch.solvers.result import exact_solution, how_it_ended, policy_gap, reducible_solution
 
 FIRST_HORIZON = 300.0  # steps
 GROWTH = 100.0
@@ -83,13 +83,7 @@ def solve_soft_bellman(
             best = state
     assert state is not None
     assert best is not None
-    if best.width <= tol * problem.reward_range:
-        status = Status.CONVERGED
-    else:
-        status = Status.STEP_LIMIT if state.step >= max_steps else Status.STAGNATED
-    message = ""
-    if status is Status.STAGNATED and len(problem.classes()[1]) > 1:
-        status, message = Status.REDUCIBLE, explain_classes(problem)
+    status, message = how_it_ended(problem, best.theta_bounds, tol, state.step, max_steps)
     return exact_solution(mdp, problem, best.value, status, state.step, best.theta_bounds, prior_policy, message)
 
 
