@@ -105,9 +105,7 @@ def solve_log_perron(
     for _ in range(power_steps):
         if np.ptp(gain) < 0.1:  # Newton is quadratic from here
             break
-        # Half steps cannot be caught by a period.
-        h = np.logaddexp(h + gain.mean(), backed_up) - np.log(2.0)
-        h -= h.max()
+        h = _half_step(h, backed_up)
         backed_up, chain = tilt(h)
         gain = backed_up - h
     ref = likely_state(chain)
@@ -137,10 +135,9 @@ def solve_log_perron(
             if refused > 5:
                 return best, best_bounds, Status.STAGNATED, step
             for _ in range(200):
-                h = np.logaddexp(h + gain.mean(), backed_up) - np.log(2.0)
-                h -= h.max()
+                h = _half_step(h, backed_up)
                 backed_up, chain = tilt(h)
-                gain = backed_up - h
+            gain = backed_up - h
             before = np.inf
             continue
         before = spread
@@ -156,3 +153,9 @@ def _step(
     new = h + lu.poisson(gain)[1]
     new -= new.max()
     return new, tilt(new)
+
+
+def _half_step(h: np.ndarray, backed_up: np.ndarray) -> np.ndarray:
+    """A power step averaged with standing still: no period can catch it."""
+    new = np.logaddexp(h + (backed_up - h).mean(), backed_up)
+    return np.asarray(new - new.max())
