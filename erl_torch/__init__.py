@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from erl_torch.experience import collect
     from erl_torch.learners.algorithm_s1 import AlgorithmS1, NonFiniteError, S1State
     from erl_torch.mdp import TabularMDP
+    from erl_torch.models import MeanRewardWarning, tabular_mdp
     from erl_torch.solution import Solution, Status
     from erl_torch.solvers import certify, iterate_biasing, perron, solve_biasing, solve_soft_bellman
     from erl_torch.transitions import Transitions
@@ -27,6 +28,7 @@ _HOME = {
     "AlgorithmS1": "learners.algorithm_s1",
     "Evaluation": "evaluation",
     "InputError": "checks",
+    "MeanRewardWarning": "models",
     "NonFiniteError": "learners.algorithm_s1",
     "S1State": "learners.algorithm_s1",
     "Solution": "solution",
@@ -40,12 +42,14 @@ _HOME = {
     "Transitions": "transitions",
     "collect": "experience",
     "evaluate": "evaluation",
+    "tabular_mdp": "models",
 }
 
 __all__ = [
     "AlgorithmS1",
     "Evaluation",
     "InputError",
+    "MeanRewardWarning",
     "NonFiniteError",
     "S1State",
     "Solution",
@@ -59,6 +63,7 @@ __all__ = [
     "perron",
     "solve_biasing",
     "solve_soft_bellman",
+    "tabular_mdp",
 ]
 
 

@@ -27,7 +27,7 @@ from erl_torch.checks import InputError
 BY_RUN = (InputError, ArithmeticError, OSError)
 BY_CONFIGURATION = (HydraException, OmegaConfBaseException)
 REPORTED = "reported by its job"
-OPEN_NODES = ("env.kwargs.",)  # keys of the user's own: no schema lists them
+OPEN_NODES = ("env.kwargs.", "env.tile_rewards.")  # keys of the user's own: no schema lists them
 
 
 class Signals:
@@ -104,6 +104,7 @@ def run(main: Callable[[], Any], about: str, conf: Path, config_name: str) -> No
     arguments = sys.argv[1:]
     # Keys that no schema lists need Hydra's "++"; the user need not know.
     arguments = [f"++{a}" if a.startswith(OPEN_NODES) else a for a in arguments]
+    arguments = [b for a in arguments for b in _by_id(a, conf)]
     sys.argv[1:] = arguments
     full = bool(os.environ.get("HYDRA_FULL_ERROR"))
     # Hydra then raises what it would otherwise print over several lines.
@@ -120,6 +121,17 @@ def run(main: Callable[[], Any], about: str, conf: Path, config_name: str) -> No
             raise
         said = REPORTED in getattr(error, "__notes__", ())
         raise SystemExit(1 if said else _report(error)) from None
+
+
+def _by_id(argument: str, conf: Path) -> list[str]:
+    """env=ID for env=NAME: the configuration with that id, or any environment of Gymnasium's."""
+    match = re.fullmatch(r"env=((?:[\w.:-]+/)?[\w.:-]+-v\d+)", argument)
+    if not match:
+        return [argument]
+    for path in sorted((conf / "env").glob("*.yaml")):
+        if match[1] in OmegaConf.to_container(OmegaConf.load(path)).values():  # type: ignore[union-attr]
+            return [f"env={path.stem}"]
+    return ["env=gym", f"env.id={match[1]}"]
 
 
 def _help(about: str, conf: Path, config_name: str, overrides: list[str]) -> str:

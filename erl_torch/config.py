@@ -21,16 +21,69 @@ from erl_torch.checks import InputError
 class WindyCliff:
     name: str = "windy_cliff"
     id: str = "erl_torch/WindyCliff-v0"
+    beta: float = 10.0
     wind_angle: float = 0.75 * math.pi
     wind_strength: float = 0.7
     trap_reward: float = -5.0
 
 
 @dataclass
+class WindyFrozenLake:
+    name: str = "windy_frozen_lake"
+    id: str = "erl_torch/WindyFrozenLake-v0"
+    beta: float = 10.0
+    desc: Any = "holes"
+    wind: str | None = None
+    wind_angle: float = 0.75 * math.pi
+    wind_strength: float = 0.3
+    n_actions: int = 4
+    action_success_prob: Any = 1.0
+    cyclic: bool = True
+    trap_reward: float = -2.0
+    tile_rewards: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass
+class WindyMaze:
+    name: str = "windy_maze"
+    id: str = "erl_torch/WindyMaze-v0"
+    beta: float = 20.0
+    size: int = 10
+    n_traps: int | None = 10
+    density: float = 0.2
+    wind_level: float = 2.0
+    maze_seed: int = 0
+    trap_reward: float = -2.0
+
+
+@dataclass
+class DynamicsShift:
+    name: str = "dynamics_shift"
+    id: str = "erl_torch/DynamicsShift-v0"
+    beta: float = 15.0
+    shifted: bool = False
+    up_success: float = 1e-4
+
+
+@dataclass
+class Mdp:
+    name: str = "mdp"
+    id: str = "erl_torch/TabularMDP-v0"
+    beta: float = 10.0
+    path: str = MISSING
+
+
+@dataclass
 class Gym:
     name: str = MISSING
     id: str = MISSING
+    beta: float = 10.0
     kwargs: dict[str, Any] = field(default_factory=dict)
+    use_model: bool = True
+    bins: Any = None
+    low: Any = None
+    high: Any = None
+    actions: Any = None
 
 
 @dataclass
@@ -104,7 +157,14 @@ class Train:
 
 
 SCHEMAS: dict[str, dict[str, type]] = {
-    "env": {"windy_cliff": WindyCliff, "gym": Gym},
+    "env": {
+        "windy_cliff": WindyCliff,
+        "windy_frozen_lake": WindyFrozenLake,
+        "windy_maze": WindyMaze,
+        "dynamics_shift": DynamicsShift,
+        "mdp": Mdp,
+        "gym": Gym,
+    },
     "learner": {"s1": S1, "exact": Exact},
     "experience": {"simulate": Simulate, "recorded": Recorded},
     "evaluation": {"standard": Standard},

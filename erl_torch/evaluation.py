@@ -15,8 +15,9 @@ import scipy.sparse.linalg as spla
 
 from erl_torch import kernels
 from erl_torch.chains import RegenerativeLU, classes
-from erl_torch.experience import known_mdp, policy_cdf, reset, sampling_tables, sizes
+from erl_torch.experience import policy_cdf, reset, sampling_tables
 from erl_torch.mdp import TabularMDP, check_policy
+from erl_torch.models import known_mdp, sizes
 
 
 class Evaluation(NamedTuple):
@@ -109,25 +110,37 @@ def evaluate(
     n_episodes: int = 20,
     horizon: int = 1000,
     prior_policy: Any = None,
+    mdp: TabularMDP | None = None,
 ) -> Evaluation:
     """Evaluate ``policy`` [S, A]: exactly where the model is known, by ``env.step`` otherwise.
 
-    Sampled episodes end after ``horizon`` steps, or where the environment ends them.
+    Args:
+        source: where the episodes are played; they end after ``horizon`` steps, or where the environment ends them.
+        policy: [S, A].
+        beta: inverse temperature, 1/reward.
+        rng: draws the episodes.
+        n_episodes: episodes behind ``mean_return``.
+        horizon: steps of an episode, and of the exact reward per step.
+        prior_policy: [S, A]; None is uniform.
+        mdp: the model behind reward per step and objective; None is ``known_mdp(source)``.
     """
     n_states, n_actions = sizes(source)
     table = check_policy("policy", policy, n_states, n_actions)
     prior = check_policy("prior_policy", prior_policy, n_states, n_actions)
-    mdp = known_mdp(source)
-    if mdp is None:
+    known = known_mdp(source)
+    model = known if mdp is None else mdp
+    endless = isinstance(source, TabularMDP) or not getattr(source.unwrapped, "ends", np.zeros(1)).any()
+    if known is not None and endless:
+        returns = np.empty(n_episodes)
+        kernels.simulate_returns(*sampling_tables(known), policy_cdf(table), horizon, rng, returns)
+        mean_return = float(returns.mean())
+    else:
         assert not isinstance(source, TabularMDP)
-        return _evaluate_by_stepping(source, table, prior, beta, rng, n_episodes, horizon)
-    returns = np.empty(n_episodes)
-    kernels.simulate_returns(*sampling_tables(mdp), policy_cdf(table), horizon, rng, returns)
-    return Evaluation(
-        mean_return=float(returns.mean()),
-        reward_per_step=reward_per_step(mdp, table, horizon),
-        objective=objective(mdp, table, prior, beta),
-    )
+        sampled = _evaluate_by_stepping(source, table, prior, beta, rng, n_episodes, horizon)
+        mean_return = sampled.mean_return
+    if model is None:
+        return sampled
+    return Evaluation(mean_return, reward_per_step(model, table, horizon), objective(model, table, prior, beta))
 
 
 def _evaluate_by_stepping(

@@ -1,7 +1,7 @@
 """Collecting a stream of tuples under a behaviour policy.
 
-A TabularMDP, or an environment that carries one as ``env.unwrapped.mdp``, is sampled in a compiled loop;
-any other Gymnasium environment with Discrete spaces through ``env.step``.
+A TabularMDP, or an environment of this package that follows one, is sampled in a compiled loop; any other Gymnasium
+environment with Discrete spaces, or vector of environments, through ``env.step``.
 
 a' is always a draw from the prior at s'. When the behaviour policy is the prior, a' is also the action
 taken next (the paper's stream); otherwise it is a draw of its own.
@@ -9,7 +9,8 @@ taken next (the paper's stream); otherwise it is a draw of its own.
 Ends of episodes. The eigenvalue problem is that of an endless process, so where an environment
 *terminates*, s' is the first state of the next episode: the terminal state leads straight to the start.
 Where an episode is only *truncated* (a time limit, or ``episode_length``), s' is the state reached, and the
-next tuple begins at a fresh start.
+next tuple begins at a fresh start. A vector environment's resets are no steps: whatever its autoreset mode, only
+real transitions enter the stream.
 """
 
 from __future__ import annotations
@@ -19,10 +20,12 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.vector import AutoresetMode
 
 from erl_torch import checks, kernels
 from erl_torch.checks import InputError
 from erl_torch.mdp import TabularMDP, check_policy
+from erl_torch.models import known_mdp, sizes
 from erl_torch.rng import Streams, streams
 from erl_torch.transitions import Transitions
 
@@ -31,27 +34,8 @@ BLOCK = 1_000_000  # steps a compiled call, so that signals and progress bars ar
 Report = Callable[[int], object]
 
 
-def known_mdp(source: TabularMDP | gym.Env[Any, Any]) -> TabularMDP | None:
-    """The model behind ``source``, where there is one: the MDP itself, or ``env.unwrapped.mdp``."""
-    if isinstance(source, TabularMDP):
-        return source
-    mdp = getattr(source.unwrapped, "mdp", None)
-    return mdp if isinstance(mdp, TabularMDP) else None
-
-
-def sizes(source: TabularMDP | gym.Env[Any, Any]) -> tuple[int, int]:
-    """(n_states, n_actions). Raises InputError unless both spaces are Discrete and start at 0."""
-    if isinstance(source, TabularMDP):
-        return source.n_states, source.n_actions
-    for name in ("observation_space", "action_space"):
-        space = getattr(source, name)
-        if not isinstance(space, gym.spaces.Discrete) or space.start != 0:
-            raise InputError(name, space, "Discrete, starting at 0 (discretise the environment first)")
-    return int(source.observation_space.n), int(source.action_space.n)  # type: ignore[attr-defined]
-
-
 def collect(
-    source: TabularMDP | gym.Env[Any, Any],
+    source: TabularMDP | gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any],
     n_episodes: int,
     episode_length: int,
     seed: int | Streams = 0,
@@ -62,9 +46,9 @@ def collect(
     """Collect experience.
 
     Args:
-        source: a TabularMDP or a Gymnasium environment with Discrete spaces.
-        n_episodes, episode_length: whole numbers >= 1. A TabularMDP gives exactly their product in tuples;
-            an environment's own ends make episodes shorter.
+        source: a TabularMDP, or a Gymnasium environment or vector environment with Discrete spaces.
+        n_episodes, episode_length: whole numbers >= 1. A TabularMDP gives exactly their product in tuples, as does a
+            vector environment, which ends its episodes itself; an environment's own ends make episodes shorter.
         seed: a whole number, or the streams of one.
         behaviour_policy: [S, A]; None is the prior.
         prior_policy: [S, A], behind a'; None is uniform.
@@ -84,6 +68,8 @@ def collect(
     mdp = known_mdp(source)
     if mdp is not None:
         return _simulate(mdp, n_episodes, episode_length, rng, behaviour, prior, on_prior, report)
+    if isinstance(source, gym.vector.VectorEnv):
+        return _step_vector(source, n_episodes * episode_length, rng, behaviour, prior, on_prior, report)
     assert not isinstance(source, TabularMDP)
     return _step_through(source, n_episodes, episode_length, rng, behaviour, prior, on_prior, report)
 
@@ -169,6 +155,66 @@ def _step_through(
             action = action_next if on_prior else draw(behaviour_cdf, state)
     report(len(rows))
     return Transitions(*(np.array(column) for column in zip(*rows, strict=True)))
+
+
+def _step_vector(
+    env: gym.vector.VectorEnv[Any, Any, Any],
+    n: int,
+    rng: Streams,
+    behaviour: np.ndarray,
+    prior: np.ndarray,
+    on_prior: bool,
+    report: Report,
+) -> Transitions:
+    """The first ``n`` tuples, step by step and within a step by environment."""
+    mode = env.metadata.get("autoreset_mode")
+    if not isinstance(mode, AutoresetMode):
+        raise InputError("metadata['autoreset_mode']", mode, "a gymnasium.vector.AutoresetMode")
+    behaviour_cdf, prior_cdf = np.cumsum(behaviour, axis=1), np.cumsum(prior, axis=1)
+
+    def draw(cdf: np.ndarray, s: np.ndarray) -> np.ndarray:
+        x = rng.behaviour.random(len(s)) * cdf[s, -1]
+        return np.asarray((cdf[s] <= x[:, None]).sum(1))
+
+    state = np.array(env.reset(seed=_seed(rng))[0])
+    action = draw(behaviour_cdf, state)
+    reward = np.zeros(env.num_envs)
+    restarting = np.zeros(env.num_envs, bool)  # this step is a reset: its observation a first state
+    unfinished = restarting.copy()  # terminated the step before: s' is that first state
+    columns: list[tuple[np.ndarray, ...]] = []
+    collected = 0
+    while collected < n:
+        observation, stepped_reward, terminated, truncated, info = env.step(action)
+        after = np.array(observation)
+        reward = np.where(restarting, reward, stepped_reward)
+        terminated, truncated = terminated & ~restarting, truncated & ~restarting
+        over = terminated | truncated
+        first = after.copy()  # first state of the next episode, where `known`
+        known = restarting.copy()
+        if over.any() and mode == AutoresetMode.SAME_STEP:
+            known |= over
+            after[over] = [int(last) for last in info["final_obs"][over]]
+        elif over.any() and mode == AutoresetMode.DISABLED:
+            known |= over
+            first = np.array(env.reset(seed=_seed(rng), options={"reset_mask": over})[0])
+        ready = (~restarting & (~terminated | known)) | unfinished
+        after = np.where((terminated & known) | unfinished, first, after)
+        action_next = draw(prior_cdf, after)
+        columns.append(tuple(column[ready] for column in (state, action, reward, after, action_next)))
+        collected += int(ready.sum())
+        report(min(collected, n))
+        goes_on = ~over & ~restarting
+        unfinished = terminated & ~known
+        held_state, held_action = state, action
+        state = np.where(goes_on, after, first)
+        action = np.where(goes_on & on_prior, action_next, draw(behaviour_cdf, state))
+        restarting = over & ~known
+        state, action = np.where(restarting, held_state, state), np.where(restarting, held_action, action)
+    return Transitions(*(np.concatenate(column)[:n] for column in zip(*columns, strict=True)))
+
+
+def _seed(rng: Streams) -> int:
+    return int(rng.environment.integers(2**31))
 
 
 def reset(env: gym.Env[Any, Any], rng: np.random.Generator) -> int:

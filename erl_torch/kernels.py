@@ -305,6 +305,31 @@ def finite_horizon_return(indptr, indices, data, reward, start, horizon):
 
 
 # ---------------------------------------------------------------------------------------------------
+# Random mazes
+# ---------------------------------------------------------------------------------------------------
+
+
+@numba.njit(cache=True, error_model="numpy")
+def smooth_wind(wind, noise):
+    """Raster sweeps, in place, in which each value becomes the mean of itself and its four periodic neighbours.
+
+    wind [n, 2, rows, cols]: the angles get one sweep for each noise [n, sweeps, rows, cols], which is added
+    to the means as they are made; the strengths get one sweep.
+    """
+    n, _, rows, cols = wind.shape
+    for m in range(n):
+        for sweep in range(noise.shape[1] + 1):
+            angles = sweep < noise.shape[1]
+            field = wind[m, 0] if angles else wind[m, 1]
+            for i in range(rows):
+                for j in range(cols):
+                    around = field[i - 1, j] + field[(i + 1) % rows, j] + field[i, j - 1] + field[i, (j + 1) % cols]
+                    field[i, j] = (field[i, j] + around) / 5
+                    if angles:
+                        field[i, j] += noise[m, sweep, i, j]
+
+
+# ---------------------------------------------------------------------------------------------------
 # Exact solvers: expectations under the tilted dynamics, in logarithms
 # ---------------------------------------------------------------------------------------------------
 

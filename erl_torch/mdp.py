@@ -6,15 +6,20 @@ Row ``s * n_actions + a`` of ``transition`` is p(.|s, a). ``reward`` is the expe
 
 from __future__ import annotations
 
+import os
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 
 from erl_torch.checks import InputError
+from erl_torch.files import read_npz, write_npz
 
 ROW_SUM_TOLERANCE = 1e-9
+CSR_PARTS = ("indptr", "indices", "data")
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +70,27 @@ class TabularMDP:
     def n_actions(self) -> int:
         return int(self.reward.shape[1])
 
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write transition_indptr, transition_indices, transition_data, reward and start to an npz file."""
+        parts = {f"transition_{name}": getattr(self.transition, name) for name in CSR_PARTS}
+        return write_npz(path, {**parts, "reward": self.reward, "start": self.start})
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> TabularMDP:
+        """Read what ``save`` wrote, or any npz with ``transition`` (or its CSR parts), ``reward`` and, if not
+        uniform, ``start``. Raises InputError naming the file."""
+        arrays = read_npz(path)
+        parts = [f"transition_{name}" for name in CSR_PARTS]
+        if "reward" not in arrays or not ("transition" in arrays or all(part in arrays for part in parts)):
+            raise InputError("path", path, f"an npz with reward and transition (or {', '.join(parts)})")
+        try:
+            transition = arrays.get("transition")
+            if transition is None:
+                transition = _csr_of_parts([arrays[part] for part in parts], arrays["reward"].shape)
+            return cls(transition, arrays["reward"], arrays.get("start"))  # type: ignore[arg-type]
+        except InputError as error:
+            raise InputError(f"{path}: {error.key}", error.value, error.allowed) from error
+
 
 def check_policy(key: str, policy: Any, n_states: int, n_actions: int) -> np.ndarray:
     """``policy`` as a float64 array [S, A] whose rows are distributions; None is the uniform policy.
@@ -91,6 +117,18 @@ def _dense(key: str, value: Any) -> np.ndarray:
         return np.ascontiguousarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise InputError(key, type(value).__name__, "an array of numbers") from error
+
+
+def _csr_of_parts(parts: Sequence[np.ndarray], sizes: tuple[int, ...]) -> sp.csr_array:
+    indptr, indices, data = parts
+    if len(sizes) != 2:
+        raise InputError("reward", f"array of shape {sizes}", "of shape [n_states, n_actions]")
+    try:
+        matrix = sp.csr_array((data, indices, indptr), shape=(sizes[0] * sizes[1], sizes[0]))
+        matrix.check_format(full_check=True)
+    except (ValueError, TypeError, IndexError) as error:
+        raise InputError("transition", "CSR parts", f"a CSR matrix [S*A, S] ({error})") from error
+    return matrix
 
 
 def _csr(value: Any, n_states: int, n_actions: int) -> sp.csr_array:

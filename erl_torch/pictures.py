@@ -9,10 +9,11 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PolyCollection
-from matplotlib.colors import to_rgb
+from matplotlib.colors import LinearSegmentedColormap, to_rgb
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle
 
-from erl_torch.envs.grid_world import MOVES, TILES, GridWorld
+from erl_torch.envs.grid_world import TILES, GridWorld
 
 DPI = 100
 MAX_PX = 400  # TensorBoard's image cards are about this wide
@@ -28,6 +29,7 @@ TILE_COLOURS = {
 }
 ARROW = "#1b4f9c"
 WIND = "#b9c6d3"
+SHARE = "#f08c00"
 
 
 def policy_picture(
@@ -36,19 +38,33 @@ def policy_picture(
     """The policy [S, A]: arrows as long as their probability on a grid, else a table of shades."""
     if grid is None:
         return table_picture(policy, title, "pi(a|s)", max_px)
-    figure, axes = _grid_axes(grid, title, max_px)
+    return grid_picture(grid, policy, title=title, max_px=max_px)
+
+
+def grid_picture(
+    grid: GridWorld,
+    policy: np.ndarray | None = None,
+    distribution: np.ndarray | None = None,
+    title: str = "",
+    max_px: int = MAX_PX,
+    scale: float = 1.0,
+) -> np.ndarray:
+    """Tiles and wind, with a policy [S, A] as arrows and a distribution over states [S] as shading.
+
+    An arrow is as long as its action's probability, a dot as wide where the action is to stay. ``scale`` gives more
+    pixels, for print, to the same drawing.
+    """
+    shaded = distribution is not None
+    figure, axes = _grid_axes(grid, title, max_px, bar=shaded)
     _tiles(axes, grid)
+    if distribution is not None:
+        shades = LinearSegmentedColormap.from_list("share of time", [(*to_rgb(SHARE), 0.0), (*to_rgb(SHARE), 1.0)])
+        image = axes.imshow(distribution.reshape(grid.shape), cmap=shades, vmin=0, zorder=1.2)
+        _bar(figure, image, "share of time")
     _wind(axes, grid)
-    # Out of H and G every action does the same: arrows there would only look like a choice.
-    free = np.flatnonzero(~np.isin(grid.tiles, ["H", "G", "W"]))
-    row, col = np.divmod(free, grid.shape[1])
-    for move, probability in zip(MOVES, policy[free].T, strict=True):
-        shown = probability > 0.02
-        dy, dx = move[:, None] * 0.46 * probability[shown]
-        axes.quiver(
-            col[shown], row[shown], dx, dy, angles="xy", scale_units="xy", units="xy", scale=1, color=ARROW,
-            width=0.06, headwidth=3.5, headlength=3.5, headaxislength=3, minlength=0.2, zorder=3,
-        )  # fmt: skip
+    if policy is not None:
+        _policy(axes, grid, policy)
+    figure.set_dpi(DPI * scale)
     return _pixels(figure)
 
 
@@ -62,12 +78,19 @@ def bias_picture(
     figure, axes = _grid_axes(grid, title, max_px, bar=True)
     row, col = np.divmod(np.arange(grid.tiles.size), grid.shape[1])
     centre = np.stack([col, row], 1)[:, None, None, :]  # [S, 1, 1, 2]
-    step = MOVES[:, ::-1] / 2  # [A, 2] in (x, y)
-    side = step[:, ::-1]  # at right angles to the step
-    corners = np.stack([np.zeros_like(step), step + side, step - side], 1)  # [A, 3, 2]
-    triangles = (centre + corners).reshape(-1, 3, 2)
+    step = grid.moves[:, ::-1]  # [A, 2] in (x, y)
+    if grid.n_actions == 4:
+        middle, side = step / 2, step[:, ::-1] / 2  # side: at right angles to the step
+        corners = np.stack([np.zeros_like(middle), middle + side, middle - side], 1)  # [A, 3, 2]
+    else:
+        square = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) / 6
+        corners = step[:, None] / 3 + square  # [A, 4, 2]
     shades = PolyCollection(
-        list(triangles), array=reward_bias.ravel(), cmap="viridis", edgecolors="#ffffff", linewidths=0.3
+        list((centre + corners).reshape(-1, *corners.shape[1:])),
+        array=reward_bias.ravel(),
+        cmap="viridis",
+        edgecolors="#ffffff",
+        linewidths=0.3,
     )
     shades.set_clim(0.0, max(float(reward_bias.max()), 1e-12))
     axes.add_collection(shades)
@@ -174,6 +197,23 @@ def _wind(axes: Axes, grid: GridWorld) -> None:
         col, row, dx, dy, angles="xy", scale_units="xy", units="xy", scale=1, pivot="mid", color=WIND,
         width=0.1, headwidth=2.5, headlength=2.5, headaxislength=2.5, zorder=1.5,
     )  # fmt: skip
+
+
+def _policy(axes: Axes, grid: GridWorld, policy: np.ndarray) -> None:
+    # Out of H and G every action does the same: arrows there would only look like a choice.
+    free = np.flatnonzero(~np.isin(grid.tiles, ["H", "G", "W"]))
+    row, col = np.divmod(free, grid.shape[1])
+    for move, probability in zip(grid.moves, policy[free].T, strict=True):
+        shown = probability > 0.02
+        if not move.any():
+            for x, y, p in zip(col[shown], row[shown], probability[shown], strict=True):
+                axes.add_patch(Circle((x, y), 0.2 * p, color=ARROW, zorder=3))
+            continue
+        dy, dx = move[:, None] * 0.46 * probability[shown]
+        axes.quiver(
+            col[shown], row[shown], dx, dy, angles="xy", scale_units="xy", units="xy", scale=1, color=ARROW,
+            width=0.06, headwidth=3.5, headlength=3.5, headaxislength=3, minlength=0.2, zorder=3,
+        )  # fmt: skip
 
 
 def _pixels(figure: Figure) -> np.ndarray:

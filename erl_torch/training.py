@@ -9,6 +9,7 @@ import contextlib
 import platform
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import fields
 from pathlib import Path
@@ -27,16 +28,18 @@ from erl_torch.checks import InputError
 from erl_torch.config import check_keys
 from erl_torch.envs.grid_world import GridWorld
 from erl_torch.evaluation import Evaluation, evaluate
-from erl_torch.experience import collect, known_mdp, sizes
+from erl_torch.experience import collect
 from erl_torch.files import read_npy, write_json
 from erl_torch.learners import LEARNERS, AlgorithmS1, Exact, ExactState, NonFiniteError, S1State
-from erl_torch.mdp import check_policy
+from erl_torch.mdp import TabularMDP, check_policy
+from erl_torch.models import MeanRewardWarning, known_mdp, sizes, tabular_mdp
 from erl_torch.rng import Streams, streams
 from erl_torch.solution import Solution, Status
 from erl_torch.solvers import certify
 from erl_torch.transitions import Transitions
 
 SafePoint = Callable[[], None]
+NOT_ARGUMENTS = ("name", "id", "beta")  # keys of conf/env that are not the environment's
 
 
 def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lambda: None) -> dict[str, Any]:
@@ -61,14 +64,15 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
     _check_evaluation(cfg.evaluation)
     env = _make_env(cfg.env)
     with contextlib.closing(env):
+        mdp = _model(cfg.env, env)
         n_states, n_actions = sizes(env)
         learner = _make_learner(cfg.learner, n_states, n_actions)
         prior = check_policy("learner.prior_policy", learner.prior_policy, n_states, n_actions)
-        run = (_Solving if isinstance(learner, Exact) else _Learning)(cfg, env, learner, rng, prior, safe_point)
+        run = (_Solving if isinstance(learner, Exact) else _Learning)(cfg, env, mdp, learner, rng, prior, safe_point)
 
         def measure(policy: torch.Tensor) -> Evaluation:
             e = cfg.evaluation
-            return evaluate(env, policy, learner.beta, rng.evaluation, e.n_episodes, e.horizon, prior)
+            return evaluate(env, policy, learner.beta, rng.evaluation, e.n_episodes, e.horizon, prior, mdp)
 
         start = state = learner.init(n_states, n_actions)
         history: list[dict[str, float]] = []
@@ -102,7 +106,6 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
             except (NonFiniteError, KeyboardInterrupt, SystemExit) as error:
                 stopped = error
             solution = run.solution(state, history, stopped)
-            mdp = known_mdp(env)
             if mdp is not None and solution.theta_bounds is None and cfg.evaluation.certify:
                 solution = certify(solution, mdp, learner.beta, prior)
             rate = run.step(state) / max(clock.seconds, 1e-9)
@@ -127,7 +130,8 @@ class _Learning:
     def __init__(
         self,
         cfg: DictConfig,
-        env: Any,
+        env: gym.Env[Any, Any],
+        mdp: TabularMDP | None,
         learner: AlgorithmS1,
         rng: Streams,
         prior: np.ndarray,
@@ -135,7 +139,7 @@ class _Learning:
     ) -> None:
         self.learner = learner
         self.sizes = sizes(env)
-        self.data = _experience(cfg.experience, env, *self.sizes, rng, prior, safe_point)
+        self.data = _experience(cfg.experience, env if mdp is None else mdp, *self.sizes, rng, prior, safe_point)
         self.n_experience = len(self.data)
         safe_point()
 
@@ -172,9 +176,15 @@ class _Solving:
     n_experience = 0
 
     def __init__(
-        self, cfg: DictConfig, env: Any, learner: Exact, rng: Streams, prior: np.ndarray, safe_point: SafePoint
+        self,
+        cfg: DictConfig,
+        env: gym.Env[Any, Any],
+        mdp: TabularMDP | None,
+        learner: Exact,
+        rng: Streams,
+        prior: np.ndarray,
+        safe_point: SafePoint,
     ) -> None:
-        mdp = known_mdp(env)
         if mdp is None:
             raise InputError(
                 "learner", "exact", f"one that learns from experience: no model of {cfg.env.name} is known"
@@ -265,17 +275,33 @@ def _group(name: str) -> Iterator[None]:
 
 
 def _make_env(cfg: DictConfig) -> gym.Env[Any, Any]:
-    if "kwargs" in cfg:
-        arguments = {str(key): value for key, value in cfg.kwargs.items()}
-    else:
-        arguments = {str(key): value for key, value in cfg.items() if key not in ("name", "id")}
+    keys: Any = OmegaConf.to_container(cfg, resolve=True)
+    arguments = keys["kwargs"] if "kwargs" in keys else {k: v for k, v in keys.items() if k not in NOT_ARGUMENTS}
     with _group("env"):
+        if isinstance(arguments.get("wind"), str):
+            arguments["wind"] = read_npy(arguments["wind"], "wind")
         try:
-            return gym.make(cfg.id, **arguments)
+            env = gym.make(cfg.id, **arguments)
         except gym.error.Error as error:
             raise InputError("id", cfg.id, f"an environment that Gymnasium has ({error})") from error
         except TypeError as error:
             raise InputError("kwargs", arguments, f"arguments of {cfg.id} ({error})") from error
+        return env
+
+
+def _model(cfg: DictConfig, env: gym.Env[Any, Any]) -> TabularMDP | None:
+    """The model to sample, to evaluate on and to certify with; None: there is ``env.step`` alone."""
+    mdp = known_mdp(env)
+    if mdp is None and cfg.get("use_model") and hasattr(env.unwrapped, "P"):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", MeanRewardWarning)
+            try:
+                mdp = tabular_mdp(env)
+            except InputError as error:
+                print(f"note: learning from env.step, for {error}", file=sys.stderr)
+        for warning in caught:
+            print(f"note: {warning.message}", file=sys.stderr)
+    return mdp
 
 
 def _make_learner(cfg: DictConfig, n_states: int, n_actions: int) -> Any:
@@ -291,7 +317,7 @@ def _make_learner(cfg: DictConfig, n_states: int, n_actions: int) -> Any:
 
 def _experience(
     cfg: DictConfig,
-    env: gym.Env[Any, Any],
+    source: TabularMDP | gym.Env[Any, Any],
     n_states: int,
     n_actions: int,
     rng: Streams,
@@ -318,7 +344,7 @@ def _experience(
                 bar.update(n - bar.n)
                 safe_point()
 
-            data = collect(env, cfg.n_episodes, cfg.episode_length, rng, behaviour, prior, report)
+            data = collect(source, cfg.n_episodes, cfg.episode_length, rng, behaviour, prior, report)
         if cfg.save_to is not None:
             data.save(cfg.save_to)
         return data

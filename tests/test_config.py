@@ -69,12 +69,28 @@ def test_every_key_is_explained(path):
             assert "#" in line or above.lstrip().startswith("#"), line
 
 
+def presets(group):
+    """Files that only set keys of another one of their group."""
+    paths = (CONF / group).glob("*.yaml")
+    return {path.stem for path in paths if OmegaConf.load(path).defaults[0] in config.SCHEMAS[group]}
+
+
 @pytest.mark.parametrize("group", sorted(config.SCHEMAS))
 def test_every_schema_has_its_yaml(group):
-    assert sorted(p.stem for p in (CONF / group).glob("*.yaml")) == sorted(config.SCHEMAS[group])
-    for path in (CONF / group).glob("*.yaml"):
-        keys = set(OmegaConf.load(path)) - {"defaults"}
-        assert keys == {f.name for f in fields(config.SCHEMAS[group][path.stem])}
+    stems = {p.stem for p in (CONF / group).glob("*.yaml")}
+    assert stems - presets(group) == set(config.SCHEMAS[group])
+    for stem in stems - presets(group):
+        keys = set(OmegaConf.load(CONF / group / f"{stem}.yaml")) - {"defaults"}
+        assert keys == {f.name for f in fields(config.SCHEMAS[group][stem])}
+
+
+@pytest.mark.parametrize("path", sorted((CONF / "env").glob("*.yaml")), ids=lambda path: path.stem)
+def test_environments_compose_and_suggest_a_beta(path):
+    needed = {"gym": ["env.id=FrozenLake-v1"], "mdp": ["env.path=mdp.npz"]}
+    cfg = composed(f"env={path.stem}", *needed.get(path.stem, []))
+    assert cfg.learner.beta == cfg.env.beta > 0
+    assert composed("learner=exact", f"env={path.stem}", "learner.beta=3").learner.beta == 3
+    config.check_keys(cfg)
 
 
 NOT_POSITIVE = st.one_of(st.floats(max_value=0.0), st.just(float("nan")), st.just(float("inf")))
@@ -139,7 +155,7 @@ def test_unknown_keys_get_one_line(tmp_path, group, key, plus):
 @pytest.mark.parametrize(
     ("overrides", "expected"),
     [
-        (["env=cliff"], "env=cliff: must be gym or windy_cliff"),
+        (["env=cliff"], "env=cliff: must be cliff_walking or dynamics_shift or frozen_lake or gym or"),
         (["env=gym"], "env.id=???: must be given, as in env.id=VALUE"),
         (["experience=recorded"], "experience.path=???: must be given, as in experience.path=VALUE"),
         (["learner.beta="], "learner.beta="),

@@ -8,7 +8,7 @@ from erl_torch.envs.grid_world import GridWorld, uniform_wind
 from erl_torch.envs.windy_cliff import WindyCliffEnv
 
 GRID = WindyCliffEnv().grid
-LARGE = GridWorld(("S" + "F" * 29,) + ("F" * 30,) * 29, uniform_wind(("F" * 30,) * 30, 1.0, 0.5))
+LARGE = GridWorld(("S" + "F" * 29,) + ("F" * 30,) * 29, uniform_wind(1.0, 0.5))
 
 
 @pytest.mark.parametrize("grid", [GRID, LARGE, None], ids=["cliff", "30x30", "table"])

@@ -177,8 +177,8 @@ def test_exact_learner_at_low_temperature_with_positive_rewards(tmp_path):
 
 
 def test_exact_learner_needs_a_model(tmp_path):
-    with pytest.raises(InputError, match="learner=exact: must be one that learns from experience: no model of Froz"):
-        train(composed("learner=exact", "env=gym", "env.id=FrozenLake-v1"), tmp_path)
+    with pytest.raises(InputError, match="learner=exact: must be one that learns from experience: no model of froz"):
+        train(composed("learner=exact", "env=frozen_lake", "env.use_model=false"), tmp_path)
 
 
 def test_failure_keeps_what_was_learnt(tmp_path):
@@ -229,7 +229,7 @@ def test_command_line_errors(tmp_path):
 def test_help_is_complete_and_needs_no_torch(tmp_path):
     done = run("--help", cwd=tmp_path, env={**os.environ, "PYTHONPROFILEIMPORTTIME": "1"})
     assert done.returncode == 0
-    for text in ("python train.py env=windy_cliff", "env={gym,windy_cliff}", "lr_psi: 0.1", "conf/"):
+    for text in ("python train.py env=windy_cliff", "windy_cliff,windy_frozen_lake", "lr_psi: 0.1", "conf/"):
         assert text in done.stdout
     assert " gymnasium\n" in done.stderr
     for module in (" torch\n", " numba\n", " scipy\n", " matplotlib\n"):

@@ -1,16 +1,58 @@
 """Environments: one file each, registered here by name.
 
-Importing this module registers them; the environments' own modules load when one is made.
+Importing this module registers them; the environments' own modules load when one is made, its functions on first use.
 """
 
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
 from gymnasium.envs.registration import register, registry
+
+if TYPE_CHECKING:
+    from erl_torch.envs.frozen_lake import windy_frozen_lake
+    from erl_torch.envs.grid_world import GridWorld
+    from erl_torch.envs.mazes import random_maze, random_mazes
+    from erl_torch.envs.shift import dynamics_shift
+    from erl_torch.envs.tabular import GridWorldEnv, TabularEnv
 
 EPISODE_LENGTH = 1000
 
 ENTRY_POINTS = {
-    "erl_torch/WindyCliff-v0": "erl_torch.envs.windy_cliff:WindyCliffEnv",
+    "erl_torch/WindyCliff-v0": "windy_cliff:WindyCliffEnv",
+    "erl_torch/WindyFrozenLake-v0": "frozen_lake:WindyFrozenLakeEnv",
+    "erl_torch/WindyMaze-v0": "windy_maze:WindyMazeEnv",
+    "erl_torch/DynamicsShift-v0": "shift:DynamicsShiftEnv",
+    "erl_torch/TabularMDP-v0": "tabular:TabularFileEnv",
 }
 
 for _id, _entry_point in ENTRY_POINTS.items():
     if _id not in registry:
-        register(_id, entry_point=_entry_point, max_episode_steps=EPISODE_LENGTH)
+        register(_id, entry_point=f"erl_torch.envs.{_entry_point}", max_episode_steps=EPISODE_LENGTH)
+
+_HOME = {
+    "GridWorld": "grid_world",
+    "GridWorldEnv": "tabular",
+    "TabularEnv": "tabular",
+    "dynamics_shift": "shift",
+    "random_maze": "mazes",
+    "random_mazes": "mazes",
+    "windy_frozen_lake": "frozen_lake",
+}
+
+__all__ = [
+    "GridWorld",
+    "GridWorldEnv",
+    "TabularEnv",
+    "dynamics_shift",
+    "random_maze",
+    "random_mazes",
+    "windy_frozen_lake",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'erl_torch.envs' has no attribute '{name}'")
+    return getattr(importlib.import_module(f"erl_torch.envs.{_HOME[name]}"), name)

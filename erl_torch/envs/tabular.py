@@ -7,22 +7,25 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from erl_torch.envs.grid_world import ACTION_NAMES, GridWorld
+from erl_torch.checks import InputError
+from erl_torch.envs.grid_world import GridWorld
 from erl_torch.mdp import TabularMDP
 
 
 class TabularEnv(gym.Env[np.int64, np.int64]):
-    """Steps through a TabularMDP. It never terminates; a time limit truncates.
+    """Steps through a TabularMDP. It terminates in the states of ``ends`` alone; a time limit truncates.
 
     Observation: the state, Discrete(n_states). Action: Discrete(n_actions). Reward: ``mdp.reward[s, a]``.
+    ``ends`` [S] bool: any step from such a state ends the episode there, where ``mdp`` leads to the start.
     """
 
     metadata = {"render_modes": ["ansi"], "render_fps": 4}  # noqa: RUF012
 
-    def __init__(self, mdp: TabularMDP, render_mode: str | None = None) -> None:
+    def __init__(self, mdp: TabularMDP, render_mode: str | None = None, ends: np.ndarray | None = None) -> None:
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
-            raise ValueError(f"render_mode={render_mode}: must be one of {self.metadata['render_modes']}")
+            raise InputError("render_mode", render_mode, " or ".join(self.metadata["render_modes"]))
         self.mdp = mdp
+        self.ends = np.zeros(mdp.n_states, bool) if ends is None else ends
         self.render_mode = render_mode
         self.observation_space = gym.spaces.Discrete(mdp.n_states)
         self.action_space = gym.spaces.Discrete(mdp.n_actions)
@@ -39,15 +42,17 @@ class TabularEnv(gym.Env[np.int64, np.int64]):
 
     def step(self, action: np.int64) -> tuple[np.int64, float, bool, bool, dict[str, Any]]:
         if not self.action_space.contains(action):
-            raise ValueError(f"action={action}: must be in [0, {self.mdp.n_actions})")
+            raise InputError("action", action, f"a whole number in [0, {self.mdp.n_actions})")
         row = self.state * self.mdp.n_actions + int(action)
         reward = float(self.mdp.reward[self.state, action])
+        self.last_action = int(action)
+        if self.ends[self.state]:
+            return np.int64(self.state), reward, True, False, {}
         p = self.mdp.transition
         entries = slice(p.indptr[row], p.indptr[row + 1])
         cdf = np.cumsum(p.data[entries])
         drawn = int(np.searchsorted(cdf, self.np_random.random() * cdf[-1], side="right"))
         self.state = int(p.indices[entries][min(drawn, len(cdf) - 1)])
-        self.last_action = int(action)
         return np.int64(self.state), reward, False, False, {}
 
     def render(self) -> Any:
@@ -56,13 +61,48 @@ class TabularEnv(gym.Env[np.int64, np.int64]):
         return None
 
 
+class TabularFileEnv(TabularEnv):
+    """A finite MDP of one's own, from an npz file.
+
+    ## Description
+    The arrays `transition` ([S, A, S] or [S*A, S]; or its sparse parts `transition_indptr`, `transition_indices`,
+    `transition_data`), `reward` [S, A] and `start` [S] (default uniform), as `erl_torch.TabularMDP.save` writes them.
+
+    ## Action Space
+    `Discrete(n_actions)`.
+
+    ## Observation Space
+    `Discrete(n_states)`.
+
+    ## Starting State
+    Drawn from `start`.
+
+    ## Rewards
+    `reward[s, a]`.
+
+    ## Episode End
+    None. The registered environment truncates after 1000 steps.
+
+    ## Arguments
+    `path` (of the npz file; needed), `render_mode` ("ansi").
+
+    ## Version History
+    v0: first version.
+    """
+
+    def __init__(self, path: str | None = None, render_mode: str | None = None) -> None:
+        if path is None:
+            raise InputError("path", None, "given: an npz file with transition, reward and start")
+        super().__init__(TabularMDP.load(path), render_mode)
+
+
 class GridWorldEnv(TabularEnv):
     """A TabularEnv on a grid, rendered as text (``ansi``) or picture (``rgb_array``)."""
 
     metadata = {"render_modes": ["ansi", "rgb_array"], "render_fps": 4}  # noqa: RUF012
 
     def __init__(self, grid: GridWorld, render_mode: str | None = None) -> None:
-        super().__init__(grid.mdp(), render_mode)
+        super().__init__(grid.mdp(), render_mode, None if grid.cyclic else grid.ends)
         self.grid = grid
         self._board: np.ndarray | None = None
 
@@ -73,12 +113,24 @@ class GridWorldEnv(TabularEnv):
             return self._render_picture()
         return None
 
+    def picture(
+        self,
+        policy: np.ndarray | None = None,
+        distribution: np.ndarray | None = None,
+        title: str = "",
+        scale: float = 3,
+    ) -> np.ndarray:
+        """A picture [height, width, 3] for print: tiles, wind, a policy [S, A], a distribution over states [S]."""
+        from erl_torch import pictures
+
+        return pictures.grid_picture(self.grid, policy, distribution, title, scale=scale)
+
     def _render_text(self) -> str:
         cols = self.grid.shape[1]
         cells = [f"[{tile}]" if s == self.state else f" {tile} " for s, tile in enumerate(self.grid.tiles.tolist())]
         lines = ["".join(cells[i : i + cols]) for i in range(0, len(cells), cols)]
         if self.last_action is not None:
-            lines.insert(0, f"  ({ACTION_NAMES[self.last_action]})")
+            lines.insert(0, f"  ({self.grid.action_names[self.last_action]})")
         return "\n".join(lines) + "\n"
 
     def _render_picture(self) -> np.ndarray:

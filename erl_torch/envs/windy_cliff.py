@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 
-from erl_torch import checks
-from erl_torch.checks import InputError
 from erl_torch.envs.grid_world import GridWorld, uniform_wind
 from erl_torch.envs.tabular import GridWorldEnv
 
@@ -50,9 +48,4 @@ class WindyCliffEnv(GridWorldEnv):
         trap_reward: float = -5.0,
         render_mode: str | None = None,
     ) -> None:
-        if not (checks.is_number(wind_angle) and math.isfinite(wind_angle)):
-            raise InputError("wind_angle", wind_angle, "a finite number (radians)")
-        if not (checks.is_number(wind_strength) and 0 <= wind_strength <= 1):
-            raise InputError("wind_strength", wind_strength, "a number in [0, 1]")
-        grid = GridWorld(DESC, uniform_wind(DESC, wind_angle, wind_strength), trap_reward)
-        super().__init__(grid, render_mode)
+        super().__init__(GridWorld(DESC, uniform_wind(wind_angle, wind_strength), trap_reward), render_mode)
