@@ -125,7 +125,7 @@ def tabular_mdp(env: gym.Env[Any, Any], on_end: str = "restart", start: Any = No
     terminal = np.unique(to[end])
     pairs = terminal[:, None] * n_actions + np.arange(n_actions)
     stays = mdp.transition[pairs.ravel()][np.arange(pairs.size), np.repeat(terminal, n_actions)].reshape(pairs.shape)
-    return _absorbing(mdp, terminal, np.where(stays > 1 - 1e-12, mdp.reward[terminal], 0.0))
+    return _absorbing(mdp, terminal, np.where((stays > 1 - 1e-12).all(1, keepdims=True), mdp.reward[terminal], 0.0))
 
 
 def _changed_by(env: gym.Env[Any, Any]) -> str | None:

@@ -4,6 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from conftest import random_mdp, random_policy
+from gymnasium.vector import AutoresetMode
 from scipy import stats
 
 import erl_torch
@@ -146,3 +147,62 @@ def test_bad_arguments(arguments, message):
 def test_continuous_spaces_are_refused():
     with pytest.raises(InputError, match=r"observation_space=.*must be Discrete"):
         erl_torch.collect(gym.make("CartPole-v1"), 1, 10)
+
+
+class Clock(gym.Env):
+    """State t = 0, 1, ...: action 1 terminates from state 3 on, else the clock truncates at 6; reward tells (s, a)."""
+
+    observation_space = gym.spaces.Discrete(8)
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        return 0, {}
+
+    def step(self, action):
+        reward = float(10 * self.t + action)
+        self.t += 1
+        return self.t, reward, bool(action and self.t > 3), self.t == 6, {}
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+def test_vector_environments_give_real_transitions_only(mode):
+    env = gym.vector.SyncVectorEnv([Clock] * 5, autoreset_mode=mode)
+    data = erl_torch.collect(env, 40, 25, seed=3)
+    assert len(data) == 1000
+    assert np.array_equal(data.r, 10 * data.s + data.a)  # no reset counted as a step, no action mixed up
+    ended = (data.a == 1) & (data.s >= 3)
+    assert (data.s_next[ended] == 0).all()  # a terminal state leads straight to the start
+    assert np.array_equal(data.s_next[~ended], data.s[~ended] + 1)  # a truncated one stands: state 6
+    assert (data.s_next == 6).any()
+    assert set(data.s) == set(range(6))
+    for action in (data.a, data.a_next):
+        assert abs(action.mean() - 0.5) < 4.5 * 0.5 / np.sqrt(1000)
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+def test_vector_environments_keep_each_environments_order(mode):
+    """One environment in the vector: its tuples chain up, a' is the action taken unless an episode begins."""
+    env = gym.vector.SyncVectorEnv([Clock], autoreset_mode=mode)
+    data = erl_torch.collect(env, 1, 300, seed=1)
+    begins = (data.s_next[:-1] == 6) | ((data.a[:-1] == 1) & (data.s[:-1] >= 3))
+    assert np.array_equal(data.s[1:], np.where(begins, 0, data.s_next[:-1]))
+    assert np.array_equal(data.a[1:][~begins], data.a_next[:-1][~begins])
+    off_prior = erl_torch.collect(env, 1, 300, seed=1, behaviour_policy=np.tile([0.9, 0.1], (8, 1)))
+    assert off_prior.a.mean() < 0.2
+    assert 0.4 < off_prior.a_next.mean() < 0.6
+
+
+def test_vector_environments_must_tell_how_they_reset():
+    env = gym.vector.SyncVectorEnv([Clock])
+    env.metadata = {}
+    with pytest.raises(InputError, match="autoreset_mode"):
+        erl_torch.collect(env, 1, 10)
+
+
+def test_vector_of_this_packages_environments():
+    env = gym.make_vec("erl_torch/WindyCliff-v0", 3, vectorization_mode="sync")
+    data = erl_torch.collect(env, 3, 1000, seed=0)
+    p = gym.make("erl_torch/WindyCliff-v0").unwrapped.mdp.transition.toarray()
+    assert (p[data.s * 4 + data.a, data.s_next] > 0).all()
