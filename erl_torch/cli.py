@@ -27,7 +27,12 @@ from erl_torch.checks import InputError
 BY_RUN = (InputError, ArithmeticError, OSError)
 BY_CONFIGURATION = (HydraException, OmegaConfBaseException)
 REPORTED = "reported by its job"
-OPEN_NODES = ("env.kwargs.", "env.tile_rewards.")  # keys of the user's own: no schema lists them
+OPEN_NODES = (
+    "env.kwargs.",
+    "env.kwargs=",
+    "env.tile_rewards.",
+    "env.tile_rewards=",
+)  # keys of the user's own: no schema lists them
 
 
 class Signals:

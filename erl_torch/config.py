@@ -80,6 +80,7 @@ class Gym:
     beta: float = 10.0
     kwargs: dict[str, Any] = field(default_factory=dict)
     use_model: bool = True
+    on_end: str = "restart"
     bins: Any = None
     low: Any = None
     high: Any = None

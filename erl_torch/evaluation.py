@@ -111,6 +111,7 @@ def evaluate(
     horizon: int = 1000,
     prior_policy: Any = None,
     mdp: TabularMDP | None = None,
+    episode: TabularMDP | None = None,
 ) -> Evaluation:
     """Evaluate ``policy`` [S, A]: exactly where the model is known, by ``env.step`` otherwise.
 
@@ -123,6 +124,8 @@ def evaluate(
         horizon: steps of an episode, and of the exact reward per step.
         prior_policy: [S, A]; None is uniform.
         mdp: the model behind reward per step and objective; None is ``known_mdp(source)``.
+        episode: a model of one episode, whose end is absorbed in states without reward: the expected return over
+            ``horizon`` steps is then exact.
     """
     n_states, n_actions = sizes(source)
     table = check_policy("policy", policy, n_states, n_actions)
@@ -130,7 +133,9 @@ def evaluate(
     known = known_mdp(source)
     model = known if mdp is None else mdp
     endless = isinstance(source, TabularMDP) or not getattr(source.unwrapped, "ends", np.zeros(1)).any()
-    if known is not None and endless:
+    if episode is not None:
+        mean_return = horizon * reward_per_step(episode, table, horizon)
+    elif known is not None and endless:
         returns = np.empty(n_episodes)
         kernels.simulate_returns(*sampling_tables(known), policy_cdf(table), horizon, rng, returns)
         mean_return = float(returns.mean())

@@ -10,7 +10,7 @@ needed:
              of playing episode after episode. Terminal states are left, but never entered.
     absorb   it leads to the terminal state s', which is never left: its own rows stand where they stay there
              (as FrozenLake's), and else become a self-loop with reward 0 (as in CliffWalking and Taxi). The average
-             reward is then mostly that of the terminal states; the solvers name such chains reducible.
+             reward is then that of the terminal states; where there are several, the solvers call it reducible.
 
 A reward that depends on s' enters as its mean r(s,a): the objective is linear in the reward, so the optimum is the
 same. Entries of P with the same s' are summed. Time limits are no part of a model.
@@ -96,7 +96,7 @@ def tabular_mdp(env: gym.Env[Any, Any], on_end: str = "restart", start: Any = No
     if mdp is not None:
         mdp = TabularMDP(mdp.transition, mdp.reward, mdp.start if start is None else start)
         ends = np.flatnonzero(getattr(base, "ends", np.zeros(mdp.n_states, bool)))
-        return mdp if on_end == "restart" else _absorbing(mdp, ends, mdp.reward[ends])
+        return mdp if on_end == "restart" else _absorbed(mdp, ends, mdp.reward[ends])
     if getattr(base, "fickle_passenger", False):
         raise InputError("fickle_passenger", True, "False: P does not tell of it (learn from env.step instead)")
     n_states, n_actions = sizes(env)
@@ -123,9 +123,17 @@ def tabular_mdp(env: gym.Env[Any, Any], on_end: str = "restart", start: Any = No
         on + sp.coo_array((p[end], (row[end], to[end])), shape=shape), mean.reshape(n_states, n_actions), start
     )
     terminal = np.unique(to[end])
-    pairs = terminal[:, None] * n_actions + np.arange(n_actions)
-    stays = mdp.transition[pairs.ravel()][np.arange(pairs.size), np.repeat(terminal, n_actions)].reshape(pairs.shape)
-    return _absorbing(mdp, terminal, np.where((stays > 1 - 1e-12).all(1, keepdims=True), mdp.reward[terminal], 0.0))
+    both = np.intersect1d(terminal, to[~end & ~np.isin(row // n_actions, terminal)])
+    if both.size:
+        raise InputError("on_end", on_end, f"restart: state {both[0]} is entered with and without an episode's end")
+    return _absorbed(mdp, terminal, np.where(absorbing(mdp)[terminal, None], mdp.reward[terminal], 0.0))
+
+
+def absorbing(mdp: TabularMDP) -> np.ndarray:
+    """[S] bool: states that no action leaves."""
+    rows = np.arange(mdp.n_states * mdp.n_actions)
+    stays = np.asarray(mdp.transition[rows, rows // mdp.n_actions]).reshape(mdp.n_states, mdp.n_actions)
+    return np.asarray((stays > 1 - 1e-12).all(1))
 
 
 def _changed_by(env: gym.Env[Any, Any]) -> str | None:
@@ -172,7 +180,7 @@ def _start(base: Any, start: Any, n_states: int) -> np.ndarray:
     return np.asarray(start / start.sum())
 
 
-def _absorbing(mdp: TabularMDP, states: np.ndarray, reward: np.ndarray) -> TabularMDP:
+def _absorbed(mdp: TabularMDP, states: np.ndarray, reward: np.ndarray) -> TabularMDP:
     """``mdp`` with ``states`` never left and the given rewards, [n] or [n, A], there."""
     among = np.zeros(mdp.n_states, bool)
     among[states] = True

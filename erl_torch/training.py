@@ -32,7 +32,7 @@ from erl_torch.experience import collect
 from erl_torch.files import read_npy, write_json
 from erl_torch.learners import LEARNERS, AlgorithmS1, Exact, ExactState, NonFiniteError, S1State
 from erl_torch.mdp import TabularMDP, check_policy
-from erl_torch.models import MeanRewardWarning, known_mdp, sizes, tabular_mdp
+from erl_torch.models import MeanRewardWarning, absorbing, known_mdp, sizes, tabular_mdp
 from erl_torch.rng import Streams, streams
 from erl_torch.solution import Solution, Status
 from erl_torch.solvers import certify
@@ -64,7 +64,7 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
     _check_evaluation(cfg.evaluation)
     env = _make_env(cfg.env)
     with contextlib.closing(env):
-        mdp = _model(cfg.env, env)
+        mdp, episode = _models(cfg.env, env)
         n_states, n_actions = sizes(env)
         learner = _make_learner(cfg.learner, n_states, n_actions)
         prior = check_policy("learner.prior_policy", learner.prior_policy, n_states, n_actions)
@@ -72,7 +72,8 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
 
         def measure(policy: torch.Tensor) -> Evaluation:
             e = cfg.evaluation
-            return evaluate(env, policy, learner.beta, rng.evaluation, e.n_episodes, e.horizon, prior, mdp)
+            horizon = min(e.horizon, (env.spec and env.spec.max_episode_steps) or e.horizon)
+            return evaluate(env, policy, learner.beta, rng.evaluation, e.n_episodes, horizon, prior, mdp, episode)
 
         start = state = learner.init(n_states, n_actions)
         history: list[dict[str, float]] = []
@@ -289,19 +290,31 @@ def _make_env(cfg: DictConfig) -> gym.Env[Any, Any]:
         return env
 
 
-def _model(cfg: DictConfig, env: gym.Env[Any, Any]) -> TabularMDP | None:
-    """The model to sample, to evaluate on and to certify with; None: there is ``env.step`` alone."""
-    mdp = known_mdp(env)
-    if mdp is None and cfg.get("use_model") and hasattr(env.unwrapped, "P"):
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always", MeanRewardWarning)
+def _models(cfg: DictConfig, env: gym.Env[Any, Any]) -> tuple[TabularMDP | None, TabularMDP | None]:
+    """The model to sample, to evaluate on and to certify with, and that of one episode; as far as there are any."""
+    on_end = cfg.get("on_end", "restart")
+    checks.one_of("env.on_end", on_end, ("restart", "absorb"))
+    if known_mdp(env) is not None or not cfg.get("use_model") or not hasattr(env.unwrapped, "P"):
+        if on_end == "absorb":
+            raise InputError("env.on_end", on_end, "restart, where there is no model (P) to read")
+        return known_mdp(env), None
+    models = {}
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", MeanRewardWarning)
+        for reading in ("restart", "absorb"):
             try:
-                mdp = tabular_mdp(env)
+                models[reading] = tabular_mdp(env, reading)
             except InputError as error:
-                print(f"note: learning from env.step, for {error}", file=sys.stderr)
-        for warning in caught:
-            print(f"note: {warning.message}", file=sys.stderr)
-    return mdp
+                if reading == on_end == "absorb":
+                    raise error.within("env") from error
+                if reading == on_end:
+                    print(f"note: learning from env.step, for {error}", file=sys.stderr)
+    for message in sorted({str(warning.message) for warning in caught}):
+        print(f"note: {message}", file=sys.stderr)
+    episode = models.get("absorb")
+    if episode is not None and episode.reward[absorbing(episode)].any():
+        episode = None  # an end that pays for ever is no end
+    return models.get(on_end), episode
 
 
 def _make_learner(cfg: DictConfig, n_states: int, n_actions: int) -> Any:

@@ -79,6 +79,13 @@ def test_absorbed_states_are_never_left_and_pay_nothing(env_id, terminal):
     assert np.array_equal(mdp.reward[others], everywhere.reward[others])
 
 
+def test_ends_that_depend_on_the_way_cannot_be_absorbed():
+    table = {0: {0: [(0.5, 1, 0.0, True), (0.5, 1, 0.0, False)]}, 1: {0: [(1.0, 0, 1.0, False)]}}
+    with pytest.raises(InputError, match="on_end=absorb: must be restart: state 1 is entered with and without"):
+        quiet(Table(table, [1.0, 0.0]), "absorb")
+    assert quiet(Table(table, [1.0, 0.0])).transition.toarray().tolist() == [[0.5, 0.5], [1, 0]]
+
+
 def test_absorbing_lake_keeps_what_its_ends_pay():
     env = gym.make("erl_torch/WindyFrozenLake-v0", desc=["SHG"], cyclic=False)
     mdp = tabular_mdp(env, "absorb")

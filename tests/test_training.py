@@ -8,13 +8,15 @@ import sys
 import time
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from conftest import random_mdp
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from test_config import composed
 
-from erl_torch import InputError, Solution, Status, Transitions
+from erl_torch import InputError, Solution, Status, Transitions, cli, evaluate
 from erl_torch.training import train
 
 ROOT = Path(__file__).parents[1]
@@ -274,3 +276,79 @@ def test_termination_keeps_what_was_learnt(tmp_path, number):
     logged = events(directory).Scalars("s1/theta")
     assert logged[-1].step == result["n_tuples"]
     assert logged[-1].value == pytest.approx(result["theta"], rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "better"),
+    [
+        (("env=windy_frozen_lake",), 20),
+        (("env=windy_frozen_lake", "env.n_actions=9", "++env.tile_rewards={N:-3}"), 20),
+        (("env=windy_maze",), 10),
+        (("env=dynamics_shift",), 100),
+        (("env=frozen_lake",), 0.01),
+        (("env=cliff_walking",), 5000),
+        (("env=taxi",), 100),
+        (("env=gym", "env.id=FrozenLake-v1", "++env.kwargs={is_slippery:false}", "env.use_model=false"), 0.05),
+    ],
+)
+def test_environments_are_learnt(tmp_path, overrides, better):
+    """The learnt policy's return in the environment lies clearly above the prior's."""
+    result = train(composed(*overrides, "experience.n_episodes=200", "evaluation.pictures=false"), tmp_path)
+    returns = [event.value for event in events(tmp_path).Scalars("eval/return")]
+    assert result["status"] == "completed"
+    assert returns[-1] > returns[0] + better
+
+
+def test_episodes_that_end_are_learnt_as_restarts(tmp_path):
+    """Leaving H or G ends the episode, the model restarts: the same problem as the endless one."""
+    common = ("env=windy_frozen_lake", "learner=exact", "learner.method=soft_bellman", "evaluation.pictures=false")
+    endless = train(composed(*common), tmp_path / "endless")
+    episodic = train(composed(*common, "env.cyclic=false"), tmp_path / "episodic")
+    assert episodic["theta"] == endless["theta"]
+    assert episodic["return"] > endless["return"]  # shorter
+
+
+def test_mdp_files_and_their_pictures(tmp_path):
+    path = random_mdp(np.random.default_rng(0), 5, 3).save(tmp_path / "mdp.npz")
+    result = train(composed("env=mdp", f"env.path={path}", *SMALL), tmp_path / "run")
+    assert result["gap"] < 0.1
+    assert result["env"] == "mdp"
+    with pytest.raises(InputError, match=r"env.path=nowhere.npz"):
+        train(composed("env=mdp", "env.path=nowhere.npz"), tmp_path / "other")
+
+
+def test_wind_fields_come_from_a_file(tmp_path):
+    wind = np.zeros((2, 8, 8))
+    np.save(tmp_path / "wind.npy", wind)
+    arguments = ("env=windy_frozen_lake", "learner=exact", "evaluation.pictures=false")
+    still = train(composed(*arguments, f"env.wind={tmp_path / 'wind.npy'}"), tmp_path / "still")
+    also = train(composed(*arguments, "env.wind_strength=0"), tmp_path / "also")
+    assert still["theta"] == pytest.approx(also["theta"], abs=1e-12)
+    with pytest.raises(InputError, match="env.wind=array of shape"):
+        train(
+            composed("env=windy_frozen_lake", "env.desc=ridge", f"env.wind={tmp_path / 'wind.npy'}"), tmp_path / "bad"
+        )
+
+
+def test_exact_return_of_an_episode(tmp_path):
+    """FrozenLake's return is the probability of reaching the goal in its 100 steps: against env.step."""
+    result = train(composed("env=frozen_lake", "learner=exact", "learner.beta=200"), tmp_path)
+    policy = Solution.load(tmp_path / "solution.npz").policy.numpy()
+    played = evaluate(gym.make("FrozenLake-v1"), policy, 200.0, np.random.default_rng(0), 3000, 100).mean_return
+    assert abs(result["return"] - played) < 4.5 * 0.5 / np.sqrt(3000)
+    assert result["return"] > 0.15  # restarts are free, so the best rate of reward is that of quick tries
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ("env=FrozenLake-v1", ["env=frozen_lake"]),
+        ("env=erl_torch/WindyCliff-v0", ["env=windy_cliff"]),
+        ("env=CartPole-v1", ["env=gym", "env.id=CartPole-v1"]),
+        ("env=my_package:My/World-v3", ["env=gym", "env.id=my_package:My/World-v3"]),
+        ("env=windy_cliff", ["env=windy_cliff"]),
+        ("seed=1", ["seed=1"]),
+    ],
+)
+def test_environments_by_id(given, expected):
+    assert cli._by_id(given, ROOT / "conf") == expected
