@@ -324,7 +324,7 @@ def test_wind_fields_come_from_a_file(tmp_path):
     still = train(composed(*arguments, f"env.wind={tmp_path / 'wind.npy'}"), tmp_path / "still")
     also = train(composed(*arguments, "env.wind_strength=0"), tmp_path / "also")
     assert still["theta"] == pytest.approx(also["theta"], abs=1e-12)
-    with pytest.raises(InputError, match="env.wind=array of shape"):
+    with pytest.raises(InputError, match=r"env\.wind=array of shape"):
         train(
             composed("env=windy_frozen_lake", "env.desc=ridge", f"env.wind={tmp_path / 'wind.npy'}"), tmp_path / "bad"
         )
