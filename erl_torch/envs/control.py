@@ -83,7 +83,7 @@ class ControlTask:
         high: Sequence[float] | None = None,
     ) -> UniformBins:
         """The bins asked for; None is the task's own. Raises InputError as ``UniformBins`` does."""
-        sizes = [bins] * len(self.bins) if isinstance(bins, int) else bins
+        sizes: Any = [bins] * len(self.bins) if bins is not None and np.ndim(bins) == 0 else bins
         parts = (
             self.bins if sizes is None else tuple(sizes),
             self.low if low is None else tuple(map(float, low)),

@@ -37,7 +37,7 @@ class UniformBins:
             lengths = f"{len(self.bins)}, {len(self.low)} and {len(self.high)} entries"
             raise InputError("bins, low, high", lengths, "of one length, one entry a dimension")
         for i, (n, low, high) in enumerate(zip(self.bins, self.low, self.high, strict=True)):
-            if not checks.is_number(n):
+            if not (checks.is_number(n) or isinstance(n, np.integer)):
                 raise InputError(f"bins[{i}]", n, "a whole number >= 1")
             checks.at_least(f"bins[{i}]", n, 1)
             for key, bound in (("low", low), ("high", high)):
@@ -45,6 +45,7 @@ class UniformBins:
                     raise InputError(f"{key}[{i}]", bound, "a finite number")
             if not low < high:
                 raise InputError(f"high[{i}]", high, f"above low[{i}]={low}")
+        object.__setattr__(self, "bins", tuple(map(int, self.bins)))
         if self.n_cells >= 2**31:
             raise InputError("bins", list(self.bins), "fewer than 2**31 cells in all")
 
