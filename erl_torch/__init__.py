@@ -13,6 +13,8 @@ import erl_torch.envs  # noqa: F401  (registers the environments)
 
 if TYPE_CHECKING:
     from erl_torch.checks import InputError
+    from erl_torch.envs.estimate import EstimatedModel, estimate_mdp
+    from erl_torch.envs.rollout import collect_rollouts, rollout
     from erl_torch.evaluation import Evaluation, evaluate
     from erl_torch.experience import collect
     from erl_torch.learners.algorithm_s1 import AlgorithmS1, NonFiniteError, S1State
@@ -26,6 +28,7 @@ __version__ = "0.1.0"
 
 _HOME = {
     "AlgorithmS1": "learners.algorithm_s1",
+    "EstimatedModel": "envs.estimate",
     "Evaluation": "evaluation",
     "InputError": "checks",
     "MeanRewardWarning": "models",
@@ -41,12 +44,16 @@ _HOME = {
     "TabularMDP": "mdp",
     "Transitions": "transitions",
     "collect": "experience",
+    "collect_rollouts": "envs.rollout",
+    "estimate_mdp": "envs.estimate",
     "evaluate": "evaluation",
     "tabular_mdp": "models",
+    "rollout": "envs.rollout",
 }
 
 __all__ = [
     "AlgorithmS1",
+    "EstimatedModel",
     "Evaluation",
     "InputError",
     "MeanRewardWarning",
@@ -58,9 +65,12 @@ __all__ = [
     "Transitions",
     "certify",
     "collect",
+    "collect_rollouts",
+    "estimate_mdp",
     "evaluate",
     "iterate_biasing",
     "perron",
+    "rollout",
     "solve_biasing",
     "solve_soft_bellman",
     "tabular_mdp",

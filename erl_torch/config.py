@@ -66,6 +66,25 @@ class DynamicsShift:
 
 
 @dataclass
+class Control:
+    name: str = MISSING
+    id: str = MISSING
+    beta: float = MISSING
+    bins: Any = None
+    low: Any = None
+    high: Any = None
+    reward: str = "cyclic"
+    stream: str = "model"
+    n_samples: int = 500
+    model_seed: int = 0
+
+
+@dataclass
+class Torque(Control):
+    torques: Any = None
+
+
+@dataclass
 class Mdp:
     name: str = "mdp"
     id: str = "erl_torch/TabularMDP-v0"
@@ -163,6 +182,10 @@ SCHEMAS: dict[str, dict[str, type]] = {
         "windy_frozen_lake": WindyFrozenLake,
         "windy_maze": WindyMaze,
         "dynamics_shift": DynamicsShift,
+        "pendulum": Torque,
+        "mountain_car": Control,
+        "cart_pole": Control,
+        "acrobot": Torque,
         "mdp": Mdp,
         "gym": Gym,
     },

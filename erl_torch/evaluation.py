@@ -6,6 +6,7 @@ states the policy visits; its maximum over policies is -theta*.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -15,9 +16,10 @@ import scipy.sparse.linalg as spla
 
 from erl_torch import kernels
 from erl_torch.chains import RegenerativeLU, classes
-from erl_torch.experience import policy_cdf, reset, sampling_tables
+from erl_torch.experience import batched, policy_cdf, reset, sampling_tables
 from erl_torch.mdp import TabularMDP, check_policy
 from erl_torch.models import known_mdp, sizes
+from erl_torch.rng import Streams
 
 
 class Evaluation(NamedTuple):
@@ -111,9 +113,9 @@ def evaluate(
     horizon: int = 1000,
     prior_policy: Any = None,
     mdp: TabularMDP | None = None,
-    episode: TabularMDP | None = None,
+    mean_return: Callable[[np.ndarray], float] | None = None,
 ) -> Evaluation:
-    """Evaluate ``policy`` [S, A]: exactly where the model is known, by ``env.step`` otherwise.
+    """Evaluate ``policy`` [S, A]: exactly where the model is known, by playing episodes otherwise.
 
     Args:
         source: where the episodes are played; they end after ``horizon`` steps, or where the environment ends them.
@@ -124,8 +126,7 @@ def evaluate(
         horizon: steps of an episode, and of the exact reward per step.
         prior_policy: [S, A]; None is uniform.
         mdp: the model behind reward per step and objective; None is ``known_mdp(source)``.
-        episode: a model of one episode, whose end is absorbed in states without reward: the expected return over
-            ``horizon`` steps is then exact.
+        mean_return: finds the mean return of a policy [S, A], in place of episodes played in ``source``.
     """
     n_states, n_actions = sizes(source)
     table = check_policy("policy", policy, n_states, n_actions)
@@ -133,22 +134,22 @@ def evaluate(
     known = known_mdp(source)
     model = known if mdp is None else mdp
     endless = isinstance(source, TabularMDP) or not getattr(source.unwrapped, "ends", np.zeros(1)).any()
-    if episode is not None:
-        mean_return = horizon * reward_per_step(episode, table, horizon)
+    if model is not None and mean_return is not None:
+        played = mean_return(table)
     elif known is not None and endless:
         returns = np.empty(n_episodes)
         kernels.simulate_returns(*sampling_tables(known), policy_cdf(table), horizon, rng, returns)
-        mean_return = float(returns.mean())
+        played = float(returns.mean())
     else:
         assert not isinstance(source, TabularMDP)
-        sampled = _evaluate_by_stepping(source, table, prior, beta, rng, n_episodes, horizon)
-        mean_return = sampled.mean_return
+        sampled = _evaluate_by_playing(source, table, prior, beta, rng, n_episodes, horizon)
+        played = sampled.mean_return
     if model is None:
         return sampled
-    return Evaluation(mean_return, reward_per_step(model, table, horizon), objective(model, table, prior, beta))
+    return Evaluation(played, reward_per_step(model, table, horizon), objective(model, table, prior, beta))
 
 
-def _evaluate_by_stepping(
+def _evaluate_by_playing(
     env: gym.Env[Any, Any],
     policy: np.ndarray,
     prior: np.ndarray,
@@ -158,6 +159,10 @@ def _evaluate_by_stepping(
     horizon: int,
 ) -> Evaluation:
     kl = kl_per_state(policy, prior)
+    batch = batched(env)
+    if batch is not None:
+        data = batch(n_episodes, horizon, seed=Streams(rng, rng, rng), behaviour_policy=policy, reward="original")
+        return Evaluation(data.r.sum() / n_episodes, data.r.mean(), float((data.r - kl[data.s] / beta).mean()))
     cdf = np.cumsum(policy, axis=1)
     total = total_kl = 0.0
     n_steps = 0

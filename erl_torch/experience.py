@@ -1,7 +1,8 @@
 """Collecting a stream of tuples under a behaviour policy.
 
-A TabularMDP, or an environment of this package that follows one, is sampled in a compiled loop; any other Gymnasium
-environment with Discrete spaces, or vector of environments, through ``env.step``.
+A TabularMDP, or an environment of this package that follows one, is sampled in a compiled loop, this package's
+control tasks in batches; any other Gymnasium environment with Discrete spaces, or vector of environments, is taken
+through ``env.step``.
 
 a' is always a draw from the prior at s'. When the behaviour policy is the prior, a' is also the action
 taken next (the paper's stream); otherwise it is a draw of its own.
@@ -25,7 +26,7 @@ from gymnasium.vector import AutoresetMode
 from erl_torch import checks, kernels
 from erl_torch.checks import InputError
 from erl_torch.mdp import TabularMDP, check_policy
-from erl_torch.models import known_mdp, sizes
+from erl_torch.models import changed_by, known_mdp, sizes
 from erl_torch.rng import Streams, streams
 from erl_torch.transitions import Transitions
 
@@ -71,7 +72,26 @@ def collect(
     if isinstance(source, gym.vector.VectorEnv):
         return _step_vector(source, n_episodes * episode_length, rng, behaviour, prior, on_prior, report)
     assert not isinstance(source, TabularMDP)
+    batch = batched(source)
+    if batch is not None:
+        return batch(
+            n_episodes, episode_length, seed=rng, behaviour_policy=None if on_prior else behaviour, prior_policy=prior
+        )
     return _step_through(source, n_episodes, episode_length, rng, behaviour, prior, on_prior, report)
+
+
+def batched(env: gym.Env[Any, Any]) -> Callable[..., Transitions] | None:
+    """``collect`` of an environment that can play many episodes at once, if it is not wrapped in something else."""
+    play = getattr(env.unwrapped, "collect", None)
+    if play is None or changed_by(env) is not None:
+        return None
+    longest = env.spec.max_episode_steps if env.spec else None
+
+    def collect_at_once(n_episodes: int, episode_length: int, **arguments: Any) -> Transitions:
+        data: Transitions = play(n_episodes, min(episode_length, longest or episode_length), **arguments)
+        return data
+
+    return collect_at_once
 
 
 def _simulate(

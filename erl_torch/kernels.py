@@ -373,3 +373,35 @@ def lazy_power(indptr, indices, data, y, steps):
         scale = 1.0 / np.max(y)
         for row in range(y.size):
             y[row] = y[row] * scale + after[row] / top
+
+
+# ---------------------------------------------------------------------------------------------------
+# A model from samples
+# ---------------------------------------------------------------------------------------------------
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def count_rows(cells, n_cells):
+    """How often each cell occurs in each row of ``cells`` [R, n] (all in [0, n_cells)).
+
+    Returns (length [R], indices, counts): occupied cells of row after row, ascending, and their counts.
+    """
+    seen = np.zeros(n_cells, np.int32)
+    length = np.empty(cells.shape[0], np.int64)
+    indices = np.empty(cells.size, np.int32)
+    counts = np.empty(cells.size, np.int32)
+    n = 0
+    for row in range(cells.shape[0]):
+        first = n
+        for i in range(cells.shape[1]):
+            cell = cells[row, i]
+            if seen[cell] == 0:
+                indices[n] = cell
+                n += 1
+            seen[cell] += 1
+        indices[first:n].sort()
+        for m in range(first, n):
+            counts[m] = seen[indices[m]]
+            seen[indices[m]] = 0
+        length[row] = n - first
+    return length, indices[:n].copy(), counts[:n].copy()

@@ -57,7 +57,7 @@ def sizes(source: TabularMDP | gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any
         space = getattr(source, single + name)
         if not isinstance(space, gym.spaces.Discrete) or space.start != 0:
             raise InputError(
-                name, space, "Discrete, starting at 0 (a Box can be discretised: erl_torch.envs.Discretise)"
+                name, space, "Discrete, starting at 0 (a Box can be cut: env.bins, or erl_torch.envs.Discretise)"
             )
         spaces.append(int(space.n))
     return spaces[0], spaces[1]
@@ -67,7 +67,7 @@ def known_mdp(source: Any) -> TabularMDP | None:
     """The MDP that ``source`` follows exactly: itself, or that of one of this package's environments."""
     if isinstance(source, TabularMDP):
         return source
-    if not isinstance(source, gym.Env) or _changed_by(source) is not None:
+    if not isinstance(source, gym.Env) or changed_by(source) is not None:
         return None
     mdp = getattr(source.unwrapped, "mdp", None)
     return mdp if isinstance(mdp, TabularMDP) else None
@@ -88,7 +88,7 @@ def tabular_mdp(env: gym.Env[Any, Any], on_end: str = "restart", start: Any = No
         MeanRewardWarning: rewards depend on s'.
     """
     checks.one_of("on_end", on_end, ("restart", "absorb"))
-    changed = _changed_by(env)
+    changed = changed_by(env)
     if changed is not None:
         raise InputError("env", env, f"without {changed}, under which the model is not known")
     base = env.unwrapped
@@ -136,8 +136,8 @@ def absorbing(mdp: TabularMDP) -> np.ndarray:
     return np.asarray((stays > 1 - 1e-12).all(1))
 
 
-def _changed_by(env: gym.Env[Any, Any]) -> str | None:
-    """The outermost wrapper that may change the process."""
+def changed_by(env: gym.Env[Any, Any]) -> str | None:
+    """The outermost wrapper of ``env`` that may change the process, or None."""
     while isinstance(env, gym.Wrapper):
         if not isinstance(env, NEUTRAL):
             return type(env).__name__

@@ -6,14 +6,15 @@ A run directory holds the event file, ``result.json`` and ``solution.npz`` (and 
 from __future__ import annotations
 
 import contextlib
+import functools
 import platform
 import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import fields
+from dataclasses import astuple, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -26,8 +27,10 @@ from erl_torch import checks, kernels, pictures
 from erl_torch.board import EXACT_LAYOUT, S1_LAYOUT, Board
 from erl_torch.checks import InputError
 from erl_torch.config import check_keys
+from erl_torch.envs.discretise import Discretise
+from erl_torch.envs.estimate import estimate_mdp
 from erl_torch.envs.grid_world import GridWorld
-from erl_torch.evaluation import Evaluation, evaluate
+from erl_torch.evaluation import Evaluation, evaluate, reward_per_step
 from erl_torch.experience import collect
 from erl_torch.files import read_npy, write_json
 from erl_torch.learners import LEARNERS, AlgorithmS1, Exact, ExactState, NonFiniteError, S1State
@@ -39,7 +42,14 @@ from erl_torch.solvers import certify
 from erl_torch.transitions import Transitions
 
 SafePoint = Callable[[], None]
-NOT_ARGUMENTS = ("name", "id", "beta")  # keys of conf/env that are not the environment's
+NOT_ARGUMENTS = (
+    "name",
+    "id",
+    "beta",
+    "stream",
+    "n_samples",
+    "model_seed",
+)  # keys of conf/env that are not the environment's
 
 
 def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lambda: None) -> dict[str, Any]:
@@ -64,16 +74,17 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
     _check_evaluation(cfg.evaluation)
     env = _make_env(cfg.env)
     with contextlib.closing(env):
-        mdp, episode = _models(cfg.env, env)
+        world = _world(cfg.env, env, safe_point)
         n_states, n_actions = sizes(env)
         learner = _make_learner(cfg.learner, n_states, n_actions)
         prior = check_policy("learner.prior_policy", learner.prior_policy, n_states, n_actions)
-        run = (_Solving if isinstance(learner, Exact) else _Learning)(cfg, env, mdp, learner, rng, prior, safe_point)
+        run = (_Solving if isinstance(learner, Exact) else _Learning)(cfg, world, learner, rng, prior, safe_point)
 
         def measure(policy: torch.Tensor) -> Evaluation:
             e = cfg.evaluation
             horizon = min(e.horizon, (env.spec and env.spec.max_episode_steps) or e.horizon)
-            return evaluate(env, policy, learner.beta, rng.evaluation, e.n_episodes, horizon, prior, mdp, episode)
+            exact = None if world.episode is None else functools.partial(_mean_return, world.episode, horizon)
+            return evaluate(env, policy, learner.beta, rng.evaluation, e.n_episodes, horizon, prior, world.mdp, exact)
 
         start = state = learner.init(n_states, n_actions)
         history: list[dict[str, float]] = []
@@ -107,8 +118,8 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
             except (NonFiniteError, KeyboardInterrupt, SystemExit) as error:
                 stopped = error
             solution = run.solution(state, history, stopped)
-            if mdp is not None and solution.theta_bounds is None and cfg.evaluation.certify:
-                solution = certify(solution, mdp, learner.beta, prior)
+            if world.mdp is not None and solution.theta_bounds is None and cfg.evaluation.certify:
+                solution = certify(solution, world.mdp, learner.beta, prior)
             rate = run.step(state) / max(clock.seconds, 1e-9)
             board.scalars({f"time/{run.unit}_per_second": rate}, run.step(state))
 
@@ -122,6 +133,14 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
     return result
 
 
+class _World(NamedTuple):
+    """What a run learns from and is judged by."""
+
+    source: TabularMDP | gym.Env[Any, Any]  # of the stream
+    mdp: TabularMDP | None  # the model to evaluate on, to certify with, and to solve
+    episode: TabularMDP | None = None  # the model of one episode: its end is absorbed, without reward
+
+
 class _Learning:
     """A run that learns from a stream of tuples."""
 
@@ -131,16 +150,15 @@ class _Learning:
     def __init__(
         self,
         cfg: DictConfig,
-        env: gym.Env[Any, Any],
-        mdp: TabularMDP | None,
+        world: _World,
         learner: AlgorithmS1,
         rng: Streams,
         prior: np.ndarray,
         safe_point: SafePoint,
     ) -> None:
         self.learner = learner
-        self.sizes = sizes(env)
-        self.data = _experience(cfg.experience, env if mdp is None else mdp, *self.sizes, rng, prior, safe_point)
+        self.sizes = sizes(world.source)
+        self.data = _experience(cfg.experience, world.source, *self.sizes, rng, prior, safe_point)
         self.n_experience = len(self.data)
         safe_point()
 
@@ -179,18 +197,17 @@ class _Solving:
     def __init__(
         self,
         cfg: DictConfig,
-        env: gym.Env[Any, Any],
-        mdp: TabularMDP | None,
+        world: _World,
         learner: Exact,
         rng: Streams,
         prior: np.ndarray,
         safe_point: SafePoint,
     ) -> None:
-        if mdp is None:
+        if world.mdp is None:
             raise InputError(
                 "learner", "exact", f"one that learns from experience: no model of {cfg.env.name} is known"
             )
-        self.learner, self.mdp = learner, mdp
+        self.learner, self.mdp = learner, world.mdp
 
     def states(self) -> Iterator[ExactState]:
         return self.learner.iterate(self.mdp)
@@ -287,17 +304,21 @@ def _make_env(cfg: DictConfig) -> gym.Env[Any, Any]:
             raise InputError("id", cfg.id, f"an environment that Gymnasium has ({error})") from error
         except TypeError as error:
             raise InputError("kwargs", arguments, f"arguments of {cfg.id} ({error})") from error
+        binning = {key: keys.get(key) for key in ("bins", "low", "high", "actions")}
+        if "kwargs" in keys and any(value is not None for value in binning.values()):
+            return Discretise(env, **binning)
         return env
 
 
-def _models(cfg: DictConfig, env: gym.Env[Any, Any]) -> tuple[TabularMDP | None, TabularMDP | None]:
-    """The model to sample, to evaluate on and to certify with, and that of one episode; as far as there are any."""
+def _world(cfg: DictConfig, env: gym.Env[Any, Any], safe_point: SafePoint) -> _World:
+    if "n_samples" in cfg:
+        return _control_world(cfg, env, safe_point)
     on_end = cfg.get("on_end", "restart")
     checks.one_of("env.on_end", on_end, ("restart", "absorb"))
     if known_mdp(env) is not None or not cfg.get("use_model") or not hasattr(env.unwrapped, "P"):
         if on_end == "absorb":
             raise InputError("env.on_end", on_end, "restart, where there is no model (P) to read")
-        return known_mdp(env), None
+        return _World(env, known_mdp(env))
     models = {}
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", MeanRewardWarning)
@@ -314,7 +335,31 @@ def _models(cfg: DictConfig, env: gym.Env[Any, Any]) -> tuple[TabularMDP | None,
     episode = models.get("absorb")
     if episode is not None and episode.reward[absorbing(episode)].any():
         episode = None  # an end that pays for ever is no end
-    return models.get(on_end), episode
+    mdp = models.get(on_end)
+    return _World(env if mdp is None else mdp, mdp, episode)
+
+
+def _control_world(cfg: DictConfig, env: gym.Env[Any, Any], safe_point: SafePoint) -> _World:
+    with _group("env"):
+        checks.one_of("stream", cfg.stream, ("model", "episodes"))
+        if cfg.stream == "episodes":
+            return _World(env, None)
+        base: Any = env.unwrapped
+        mdp = estimate_mdp(
+            base.task,
+            *astuple(base.bins),
+            actions=base.actions if base.task.max_action is not None else None,
+            n_samples=cfg.n_samples,
+            seed=cfg.model_seed,
+            report=lambda _: safe_point(),
+            progress=True,
+        ).mdp
+    # Episodes of the stream start in any cell, so that all are learnt about.
+    return _World(TabularMDP(mdp.transition, mdp.reward), mdp)
+
+
+def _mean_return(episode: TabularMDP, horizon: int, policy: np.ndarray) -> float:
+    return horizon * reward_per_step(episode, policy, horizon)
 
 
 def _make_learner(cfg: DictConfig, n_states: int, n_actions: int) -> Any:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from gymnasium.envs.registration import register, registry
 
 if TYPE_CHECKING:
+    from erl_torch.envs.discretise import Discretise, UniformBins
     from erl_torch.envs.frozen_lake import windy_frozen_lake
     from erl_torch.envs.grid_world import GridWorld
     from erl_torch.envs.mazes import random_maze, random_mazes
@@ -18,6 +19,16 @@ if TYPE_CHECKING:
     from erl_torch.envs.tabular import GridWorldEnv, TabularEnv
 
 EPISODE_LENGTH = 1000
+CONTROL_EPISODE_LENGTH = 500
+
+# Classic control with binned states: the task's module, and its environment's name there and here.
+CONTROL_TASKS = {
+    "pendulum": "DiscretePendulum",
+    "mountain_car": "DiscreteMountainCar",
+    "cart_pole": "DiscreteCartPole",
+    "acrobot": "DiscreteAcrobot",
+}
+CONTROL_ENTRY_POINTS = {f"erl_torch/{name}-v0": f"{module}:{name}Env" for module, name in CONTROL_TASKS.items()}
 
 ENTRY_POINTS = {
     "erl_torch/WindyCliff-v0": "windy_cliff:WindyCliffEnv",
@@ -25,16 +36,20 @@ ENTRY_POINTS = {
     "erl_torch/WindyMaze-v0": "windy_maze:WindyMazeEnv",
     "erl_torch/DynamicsShift-v0": "shift:DynamicsShiftEnv",
     "erl_torch/TabularMDP-v0": "tabular:TabularFileEnv",
+    **CONTROL_ENTRY_POINTS,
 }
 
 for _id, _entry_point in ENTRY_POINTS.items():
     if _id not in registry:
-        register(_id, entry_point=f"erl_torch.envs.{_entry_point}", max_episode_steps=EPISODE_LENGTH)
+        _length = CONTROL_EPISODE_LENGTH if _id in CONTROL_ENTRY_POINTS else EPISODE_LENGTH
+        register(_id, entry_point=f"erl_torch.envs.{_entry_point}", max_episode_steps=_length)
 
 _HOME = {
+    "Discretise": "discretise",
     "GridWorld": "grid_world",
     "GridWorldEnv": "tabular",
     "TabularEnv": "tabular",
+    "UniformBins": "discretise",
     "dynamics_shift": "shift",
     "random_maze": "mazes",
     "random_mazes": "mazes",
@@ -42,9 +57,11 @@ _HOME = {
 }
 
 __all__ = [
+    "Discretise",
     "GridWorld",
     "GridWorldEnv",
     "TabularEnv",
+    "UniformBins",
     "dynamics_shift",
     "random_maze",
     "random_mazes",

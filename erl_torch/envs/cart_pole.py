@@ -1,0 +1,82 @@
+"""The cart and pole of Gymnasium, binned."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+
+from erl_torch.envs.control import ControlEnv, ControlTask, Step
+
+GRAVITY, MASS_POLE, MASS, HALF_LENGTH, FORCE, DT = 9.8, 0.1, 1.1, 0.5, 10.0, 0.02
+MAX_POSITION, MAX_ANGLE = 2.4, math.radians(12)
+
+
+def step(state: torch.Tensor, direction: torch.Tensor) -> Step:
+    x, x_dot, angle, angle_dot = state.unbind(1)
+    cos, sin = angle.cos(), angle.sin()
+    push = (direction * FORCE + MASS_POLE * HALF_LENGTH * angle_dot**2 * sin) / MASS
+    angle_acc = (GRAVITY * sin - cos * push) / (HALF_LENGTH * (4 / 3 - MASS_POLE / MASS * cos**2))
+    x_acc = push - MASS_POLE * HALF_LENGTH / MASS * angle_acc * cos
+    x, angle = x + DT * x_dot, angle + DT * angle_dot
+    state = torch.stack((x, x_dot + DT * x_acc, angle, angle_dot + DT * angle_acc)).T
+    return Step(state, torch.ones_like(x), (x.abs() > MAX_POSITION) | (angle.abs() > MAX_ANGLE))
+
+
+TASK = ControlTask(
+    name="cart_pole",
+    gymnasium_id="CartPole-v1",
+    bins=(8, 8, 8, 8),
+    low=(-2.5, -3.5, -0.25, -2.5),
+    high=(2.5, 3.5, 0.25, 2.5),
+    actions=(-1.0, 1.0),
+    max_action=None,
+    beta=10.0,
+    reset_low=(-0.05,) * 4,
+    reset_high=(0.05,) * 4,
+    step=step,
+    instant_reward=lambda state, step: torch.where(step.terminated, 0.0, step.reward),
+    variables=lambda state: state,
+)
+
+
+class DiscreteCartPoleEnv(ControlEnv):
+    """Balance a pole on a cart; positions and velocities are binned.
+
+    ## Description
+    Gymnasium's `CartPole-v1`, which takes each step; the learner sees the bin of the state.
+
+    ## Action Space
+    `Discrete(2)`: 0 push left, 1 push right.
+
+    ## Observation Space
+    `Discrete(4096)`: position, velocity, angle and angular velocity, uniform bins, little-endian.
+
+    ## Starting State
+    All four uniform in +-0.05.
+
+    ## Rewards
+    1 a step, also for the step that fails. With `reward="cyclic"` 0 for that one.
+
+    ## Episode End
+    Terminates when the position leaves +-2.4 or the angle +-12 degrees. The registered environment truncates after
+    500 steps.
+
+    ## Arguments
+    `bins` (8, or one number a variable), `low`, `high` (+-2.5, +-3.5, +-0.25, +-2.5), `reward` ("original" or
+    "cyclic"), `render_mode` ("human" or "rgb_array").
+
+    ## Version History
+    v0: the setting of the paper's Table S2.
+    """
+
+    def __init__(
+        self,
+        bins: int | Sequence[int] | None = None,
+        low: Sequence[float] | None = None,
+        high: Sequence[float] | None = None,
+        reward: str = "original",
+        render_mode: str | None = None,
+    ) -> None:
+        super().__init__(TASK, bins, low, high, None, reward, render_mode)

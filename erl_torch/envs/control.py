@@ -1,0 +1,190 @@
+"""Classic control with binned states: what the tasks share.
+
+A ``ControlTask`` holds the dynamics of one of Gymnasium's environments as pure functions over tensors, so that many
+states step at once on any device. ``ControlEnv`` is the same task with Discrete spaces over Gymnasium's own
+environment. ``erl_torch.envs.estimate`` turns a task into a TabularMDP, ``erl_torch.envs.rollout`` plays episodes in
+the original dynamics.
+
+A state tensor is [N, d]; columns are best contiguous (``torch.stack(columns).T``). All is float64.
+"""
+
+from __future__ import annotations
+
+import importlib
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+import torch
+
+from erl_torch import checks
+from erl_torch.checks import InputError
+from erl_torch.envs import CONTROL_TASKS
+from erl_torch.envs.discretise import Discretise, UniformBins
+from erl_torch.transitions import Transitions
+
+REWARDS = ("original", "cyclic")
+
+
+class Step(NamedTuple):
+    """What one step makes of N states."""
+
+    state: torch.Tensor  # [N, d]
+    reward: torch.Tensor  # [N], Gymnasium's
+    terminated: torch.Tensor  # [N] bool
+
+
+@dataclass(frozen=True)
+class ControlTask:
+    """One of Gymnasium's classic control environments, batched.
+
+    Args:
+        name: its key in ``erl_torch.envs.CONTROL_TASKS``.
+        gymnasium_id: the original.
+        bins, low, high: default bins of ``variables``.
+        actions: default values of the actions.
+        max_action: the largest |value| that the original takes; None where its actions cannot be changed.
+        beta: inverse temperature in the paper's Table S2.
+        reset_low, reset_high: the first state is uniform in this box.
+        step: (states [N, d], action values [N]) -> Step, equal to the original's ``env.step``.
+        instant_reward: (states [N, d], their Step) -> reward [N] of the paper's model, where nothing ends.
+        variables: states [N, d] -> the variables that are binned, [N, d].
+        features: one observation of the original -> these variables, [d]; None where they are equal.
+        reset_dtype: precision in which the original draws its first state.
+    """
+
+    name: str
+    gymnasium_id: str
+    bins: tuple[int, ...]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    actions: tuple[float, ...]
+    max_action: float | None
+    beta: float
+    reset_low: tuple[float, ...]
+    reset_high: tuple[float, ...]
+    step: Callable[[torch.Tensor, torch.Tensor], Step]
+    instant_reward: Callable[[torch.Tensor, Step], torch.Tensor]
+    variables: Callable[[torch.Tensor], torch.Tensor]
+    features: Callable[[np.ndarray], np.ndarray] | None = None
+    reset_dtype: torch.dtype = torch.float64
+
+    def initial(self, n: int, rng: np.random.Generator) -> torch.Tensor:
+        """[n, d] first states, as the original draws them."""
+        draws = rng.uniform(self.reset_low, self.reset_high, (n, len(self.reset_low)))
+        return torch.from_numpy(draws).to(self.reset_dtype).double()
+
+    def uniform_bins(
+        self,
+        bins: int | Sequence[int] | None = None,
+        low: Sequence[float] | None = None,
+        high: Sequence[float] | None = None,
+    ) -> UniformBins:
+        """The bins asked for; None is the task's own. Raises InputError as ``UniformBins`` does."""
+        sizes: Any = [bins] * len(self.bins) if bins is not None and np.ndim(bins) == 0 else bins
+        parts = (
+            self.bins if sizes is None else tuple(sizes),
+            self.low if low is None else tuple(map(float, low)),
+            self.high if high is None else tuple(map(float, high)),
+        )
+        if len(parts[0]) != len(self.bins):
+            raise InputError("bins", list(parts[0]), f"a whole number or {len(self.bins)} of them")
+        return UniformBins(*parts)
+
+    def action_values(self, actions: Sequence[float] | None = None) -> tuple[float, ...]:
+        """The values asked for; None is the task's own. Raises InputError for values the original refuses."""
+        if actions is None:
+            return self.actions
+        if self.max_action is None:
+            raise InputError("actions", list(actions), f"left out: those of {self.gymnasium_id} are fixed")
+        values = tuple(actions)
+        good = all(checks.is_number(x) and math.isfinite(x) and abs(x) <= self.max_action for x in values)
+        if not values or not good:
+            limit = f" of at most {self.max_action:g} in size" if math.isfinite(self.max_action) else ""
+            raise InputError("actions", list(values), f"a list of finite numbers{limit}")
+        return tuple(map(float, values))
+
+
+def control_task(task: str | ControlTask) -> ControlTask:
+    """The task of that name. Raises InputError for an unknown one."""
+    if isinstance(task, ControlTask):
+        return task
+    checks.one_of("task", task, tuple(CONTROL_TASKS))
+    found: ControlTask = importlib.import_module(f"erl_torch.envs.{task}").TASK
+    return found
+
+
+def wrap(angle: torch.Tensor) -> torch.Tensor:
+    """``angle`` (radians) brought into [-pi, pi) by whole turns."""
+    return angle - 2 * math.pi * torch.floor((angle + math.pi) * (0.5 / math.pi))
+
+
+class ControlEnv(gym.Env[np.int64, np.int64]):
+    """A control task with Discrete spaces: the original steps, its state is binned.
+
+    Args:
+        task: the task.
+        bins, low, high, actions: as in ``erl_torch.estimate_mdp``.
+        reward: "original", or "cyclic": 0 for the step that terminates. Learn from that one: some originals pay the
+            same for every step, so that a stream of episodes would not tell short from long.
+        render_mode: the original's.
+    """
+
+    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 30}  # noqa: RUF012
+
+    def __init__(
+        self,
+        task: ControlTask,
+        bins: int | Sequence[int] | None = None,
+        low: Sequence[float] | None = None,
+        high: Sequence[float] | None = None,
+        actions: Sequence[float] | None = None,
+        reward: str = "original",
+        render_mode: str | None = None,
+    ) -> None:
+        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
+            raise InputError("render_mode", render_mode, " or ".join(self.metadata["render_modes"]))
+        checks.one_of("reward", reward, REWARDS)
+        self.task, self.reward, self.render_mode = task, reward, render_mode
+        self.bins = task.uniform_bins(bins, low, high)
+        self.actions = task.action_values(actions)
+        original = gym.make(task.gymnasium_id, render_mode=render_mode).unwrapped  # without its time limit
+        self.metadata = original.metadata
+        values = list(self.actions) if isinstance(original.action_space, gym.spaces.Box) else None
+        if values is None and task.max_action is not None:
+            original.AVAIL_TORQUE = list(self.actions)  # type: ignore[attr-defined]  # Acrobot
+            original.action_space = gym.spaces.Discrete(len(self.actions))
+        bounds = self.bins.low, self.bins.high
+        self.env = Discretise(original, self.bins.bins, *bounds, values, task.features)
+        self.observation_space = gym.spaces.Discrete(self.bins.n_cells)
+        self.action_space = gym.spaces.Discrete(len(self.actions))
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.int64, dict[str, Any]]:
+        super().reset(seed=seed)
+        return self.env.reset(seed=seed, options=options)
+
+    def step(self, action: np.int64) -> tuple[np.int64, float, bool, bool, dict[str, Any]]:
+        cell, reward, terminated, truncated, info = self.env.step(action)
+        if terminated and self.reward == "cyclic":
+            reward = 0.0
+        return cell, reward, terminated, truncated, info
+
+    def collect(self, n_episodes: int, episode_length: int, **arguments: Any) -> Transitions:
+        """Episodes of this environment, all at once; arguments as in ``collect_rollouts``."""
+        from erl_torch.envs.rollout import collect_rollouts
+
+        settings: dict[str, Any] = {"bins": self.bins, "reward": self.reward} | arguments
+        if self.task.max_action is not None:
+            settings["actions"] = self.actions
+        return collect_rollouts(self.task, n_episodes, episode_length, **settings)
+
+    def render(self) -> Any:
+        return self.env.render()
+
+    def close(self) -> None:
+        self.env.close()
