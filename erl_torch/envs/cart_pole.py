@@ -16,11 +16,13 @@ MAX_POSITION, MAX_ANGLE = 2.4, math.radians(12)
 def step(state: torch.Tensor, direction: torch.Tensor) -> Step:
     x, x_dot, angle, angle_dot = state.unbind(1)
     cos, sin = angle.cos(), angle.sin()
-    push = (direction * FORCE + MASS_POLE * HALF_LENGTH * angle_dot**2 * sin) / MASS
-    angle_acc = (GRAVITY * sin - cos * push) / (HALF_LENGTH * (4 / 3 - MASS_POLE / MASS * cos**2))
-    x_acc = push - MASS_POLE * HALF_LENGTH / MASS * angle_acc * cos
-    x, angle = x + DT * x_dot, angle + DT * angle_dot
-    state = torch.stack((x, x_dot + DT * x_acc, angle, angle_dot + DT * angle_acc)).T
+    moment = MASS_POLE * HALF_LENGTH / MASS
+    push = torch.addcmul(direction * (FORCE / MASS), angle_dot**2, sin, value=moment)
+    angle_acc = (GRAVITY * sin - cos * push) / (HALF_LENGTH * 4 / 3 - moment * cos**2)
+    x_acc = torch.addcmul(push, angle_acc, cos, value=-moment)
+    x, angle = x.add(x_dot, alpha=DT), angle.add(angle_dot, alpha=DT)
+    x_dot, angle_dot = x_dot.add(x_acc, alpha=DT), angle_dot.add(angle_acc, alpha=DT)
+    state = torch.stack((x, x_dot, angle, angle_dot)).T
     return Step(state, torch.ones_like(x), (x.abs() > MAX_POSITION) | (angle.abs() > MAX_ANGLE))
 
 

@@ -61,9 +61,13 @@ class UniformBins:
         cell: Any = 0.0
         stride = 1.0
         for i, (n, low, high) in enumerate(zip(self.bins, self.low, self.high, strict=True)):
-            place = ((points[:, i] - low) * (n / (high - low))).clip(0, n - 1)
+            place = points[:, i] - low
+            place *= n / (high - low)
+            place = place.clip(0, n - 1)
             place = np.floor(place) if isinstance(place, np.ndarray) else place.floor_()
-            cell = cell + place * stride
+            place *= stride
+            place += cell
+            cell = place
             stride *= n
         if (cell != cell).any():
             raise InputError("points", "nan", "numbers")
