@@ -12,7 +12,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import astuple, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -347,7 +347,9 @@ def _control_world(cfg: DictConfig, env: gym.Env[Any, Any], safe_point: SafePoin
         base: Any = env.unwrapped
         mdp = estimate_mdp(
             base.task,
-            *astuple(base.bins),
+            base.bins.bins,
+            base.bins.low,
+            base.bins.high,
             actions=base.actions if base.task.max_action is not None else None,
             n_samples=cfg.n_samples,
             seed=cfg.model_seed,

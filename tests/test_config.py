@@ -155,7 +155,7 @@ def test_unknown_keys_get_one_line(tmp_path, group, key, plus):
 @pytest.mark.parametrize(
     ("overrides", "expected"),
     [
-        (["env=cliff"], "env=cliff: must be cliff_walking or dynamics_shift or frozen_lake or gym or"),
+        (["env=cliff"], "env=cliff: must be acrobot or cart_pole or cliff_walking or dynamics_shift or"),
         (["env=gym"], "env.id=???: must be given, as in env.id=VALUE"),
         (["experience=recorded"], "experience.path=???: must be given, as in experience.path=VALUE"),
         (["learner.beta="], "learner.beta="),

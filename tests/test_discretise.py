@@ -156,7 +156,7 @@ def test_box_actions():
     assert Discretise(Fixed(BOX, BOX), 4, actions=[[0, 1], [1, 0]]).actions.tolist() == [[0, 1], [1, 0]]
     pendulum = Discretise(gym.make("Pendulum-v1"), 5, actions=[-2, 0.5])
     assert pendulum.actions.tolist() == [[-2], [0.5]]
-    with pytest.raises(ValueError, match=r"action=2: must be in \[0, 2\)"):
+    with pytest.raises(ValueError, match=r"action=2: must be a whole number in \[0, 2\)"):
         pendulum.step(2)
 
 
