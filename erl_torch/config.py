@@ -18,10 +18,21 @@ from erl_torch.checks import InputError
 
 
 @dataclass
+class Suggest:
+    """What suits an environment; the yaml files of learners and experience refer to it."""
+
+    beta: float = 10.0
+    lr_u: float = 0.005
+    lr_rho: float | None = None
+    n_episodes: int = 500
+    episode_length: int = 1000
+
+
+@dataclass
 class WindyCliff:
     name: str = "windy_cliff"
     id: str = "erl_torch/WindyCliff-v0"
-    beta: float = 10.0
+    suggest: Suggest = field(default_factory=Suggest)
     wind_angle: float = 0.75 * math.pi
     wind_strength: float = 0.7
     trap_reward: float = -5.0
@@ -31,7 +42,7 @@ class WindyCliff:
 class WindyFrozenLake:
     name: str = "windy_frozen_lake"
     id: str = "erl_torch/WindyFrozenLake-v0"
-    beta: float = 10.0
+    suggest: Suggest = field(default_factory=Suggest)
     desc: Any = "holes"
     wind: str | None = None
     wind_angle: float = 0.75 * math.pi
@@ -47,7 +58,7 @@ class WindyFrozenLake:
 class WindyMaze:
     name: str = "windy_maze"
     id: str = "erl_torch/WindyMaze-v0"
-    beta: float = 20.0
+    suggest: Suggest = field(default_factory=Suggest)
     size: int = 10
     n_traps: int | None = 10
     density: float = 0.2
@@ -60,7 +71,7 @@ class WindyMaze:
 class DynamicsShift:
     name: str = "dynamics_shift"
     id: str = "erl_torch/DynamicsShift-v0"
-    beta: float = 15.0
+    suggest: Suggest = field(default_factory=Suggest)
     shifted: bool = False
     up_success: float = 1e-4
 
@@ -69,7 +80,7 @@ class DynamicsShift:
 class Control:
     name: str = MISSING
     id: str = MISSING
-    beta: float = MISSING
+    suggest: Suggest = field(default_factory=Suggest)
     bins: Any = None
     low: Any = None
     high: Any = None
@@ -88,7 +99,7 @@ class Torque(Control):
 class Mdp:
     name: str = "mdp"
     id: str = "erl_torch/TabularMDP-v0"
-    beta: float = 10.0
+    suggest: Suggest = field(default_factory=Suggest)
     path: str = MISSING
 
 
@@ -96,7 +107,7 @@ class Mdp:
 class Gym:
     name: str = MISSING
     id: str = MISSING
-    beta: float = 10.0
+    suggest: Suggest = field(default_factory=Suggest)
     kwargs: dict[str, Any] = field(default_factory=dict)
     use_model: bool = True
     on_end: str = "restart"
@@ -164,6 +175,7 @@ class Standard:
     horizon: int = 1000
     pictures: bool = True
     certify: bool = True
+    exact_up_to: int = 1_000_000
 
 
 @dataclass
@@ -222,8 +234,6 @@ def register() -> None:
 def check_keys(cfg: DictConfig) -> None:
     """Raise InputError for a key that no schema has, and for one that has no value."""
     _check_node(cfg, Train, "")
-    for group in SCHEMAS:
-        _check_node(cfg[group], OmegaConf.get_type(cfg[group]), f"{group}.")
 
 
 def _check_node(node: DictConfig, schema: Any, prefix: str) -> None:
@@ -231,5 +241,7 @@ def _check_node(node: DictConfig, schema: Any, prefix: str) -> None:
     for name in map(str, node):
         if name not in known:
             raise InputError(prefix + name, node[name], f"left out: no such key; there are {', '.join(known)}")
+        if is_dataclass(OmegaConf.get_type(node, name)):
+            _check_node(node[name], OmegaConf.get_type(node, name), f"{prefix}{name}.")
         if OmegaConf.is_missing(node, name):
             raise InputError(prefix + name, "???", f"given, as in {prefix}{name}=VALUE")

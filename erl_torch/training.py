@@ -42,14 +42,7 @@ from erl_torch.solvers import certify
 from erl_torch.transitions import Transitions
 
 SafePoint = Callable[[], None]
-NOT_ARGUMENTS = (
-    "name",
-    "id",
-    "beta",
-    "stream",
-    "n_samples",
-    "model_seed",
-)  # keys of conf/env that are not the environment's
+NOT_ARGUMENTS = ("name", "id", "suggest", "stream", "n_samples", "model_seed")
 
 
 def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lambda: None) -> dict[str, Any]:
@@ -75,6 +68,10 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
     env = _make_env(cfg.env)
     with contextlib.closing(env):
         world = _world(cfg.env, env, safe_point)
+        judge = world.mdp
+        if judge is not None and judge.transition.nnz > cfg.evaluation.exact_up_to:
+            judge = None
+            print("note: a large model (evaluation.exact_up_to): episodes are played instead", file=sys.stderr)
         n_states, n_actions = sizes(env)
         learner = _make_learner(cfg.learner, n_states, n_actions)
         prior = check_policy("learner.prior_policy", learner.prior_policy, n_states, n_actions)
@@ -84,7 +81,7 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
             e = cfg.evaluation
             horizon = min(e.horizon, (env.spec and env.spec.max_episode_steps) or e.horizon)
             exact = None if world.episode is None else functools.partial(_mean_return, world.episode, horizon)
-            return evaluate(env, policy, learner.beta, rng.evaluation, e.n_episodes, horizon, prior, world.mdp, exact)
+            return evaluate(env, policy, learner.beta, rng.evaluation, e.n_episodes, horizon, prior, judge, exact)
 
         start = state = learner.init(n_states, n_actions)
         history: list[dict[str, float]] = []
@@ -118,8 +115,8 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
             except (NonFiniteError, KeyboardInterrupt, SystemExit) as error:
                 stopped = error
             solution = run.solution(state, history, stopped)
-            if world.mdp is not None and solution.theta_bounds is None and cfg.evaluation.certify:
-                solution = certify(solution, world.mdp, learner.beta, prior)
+            if judge is not None and solution.theta_bounds is None and cfg.evaluation.certify:
+                solution = certify(solution, judge, learner.beta, prior)
             rate = run.step(state) / max(clock.seconds, 1e-9)
             board.scalars({f"time/{run.unit}_per_second": rate}, run.step(state))
 
@@ -412,7 +409,7 @@ def _experience(
 
 def _check_evaluation(cfg: DictConfig) -> None:
     with _group("evaluation"):
-        for key in ("every", "n_episodes", "horizon"):
+        for key in ("every", "n_episodes", "horizon", "exact_up_to"):
             checks.at_least(key, cfg[key], 1)
 
 

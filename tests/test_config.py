@@ -88,7 +88,7 @@ def test_every_schema_has_its_yaml(group):
 def test_environments_compose_and_suggest_a_beta(path):
     needed = {"gym": ["env.id=FrozenLake-v1"], "mdp": ["env.path=mdp.npz"]}
     cfg = composed(f"env={path.stem}", *needed.get(path.stem, []))
-    assert cfg.learner.beta == cfg.env.beta > 0
+    assert cfg.learner.beta == cfg.env.suggest.beta > 0
     assert composed("learner=exact", f"env={path.stem}", "learner.beta=3").learner.beta == 3
     config.check_keys(cfg)
 
@@ -122,6 +122,7 @@ BAD_VALUES = {
     "evaluation.every": NOT_A_COUNT,
     "evaluation.n_episodes": NOT_A_COUNT,
     "evaluation.horizon": NOT_A_COUNT,
+    "evaluation.exact_up_to": NOT_A_COUNT,
     "env.wind_strength": st.one_of(st.floats(max_value=-1e-9), st.floats(min_value=1.0, exclude_min=True)),
     "env.wind_angle": st.sampled_from([float("nan"), float("inf")]),
     "seed": st.integers(max_value=-1),

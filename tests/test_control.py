@@ -264,7 +264,7 @@ def test_random_rollouts_have_gymnasiums_law():
     ours = rollout("cart_pole", policy, 2000, 500, np.random.default_rng(0))
     assert np.array_equal(ours.returns, ours.lengths)
     cyclic = rollout("cart_pole", policy, 2000, 500, np.random.default_rng(0), reward="cyclic")
-    assert np.array_equal(cyclic.returns, ours.returns - 1)
+    assert (cyclic.returns == -1).all()
     env, rng, theirs = gym.make("CartPole-v1").unwrapped, np.random.default_rng(1), []
     for seed in range(400):
         env.reset(seed=seed)
@@ -283,8 +283,8 @@ def test_collected_stream(on_prior):
     behaviour = None if on_prior else np.tile([0.6, 0.4], (8**4, 1))
     settings = dict(behaviour_policy=behaviour, prior_policy=prior)
     data = collect_rollouts("cart_pole", 1500, 15, 3, **settings)
-    ended = data.r == 0
-    assert set(data.r.tolist()) == {0.0, 1.0}
+    ended = data.r == -1
+    assert set(data.r.tolist()) == {-1.0, 0.0}
     begins, age, n_truncated = [0], 1, 0
     for t in range(len(data) - 1):
         over = ended[t] or age == 15
@@ -315,11 +315,14 @@ def test_collected_stream(on_prior):
 
 def test_collected_stream_against_stepping():
     """The same law of (s, a, s') as ``collect`` through env.step: mean reward and length of episodes agree."""
-    stepped = erl_torch.collect(gym.make("erl_torch/DiscreteCartPole-v0", reward="cyclic"), 300, 500, 0)
-    batched = collect_rollouts("cart_pole", 3000, 500, 0)
-    assert (stepped.r == 0).sum() == 300
-    assert (batched.r == 0).sum() == 3000
-    lengths = [np.diff(np.flatnonzero(data.r == 0), prepend=-1) for data in (stepped, batched)]
+    env = gym.make("erl_torch/DiscreteCartPole-v0", reward="cyclic")
+    stepped = erl_torch.collect(gym.wrappers.TransformReward(env, float), 300, 500, 0)  # wrapped: env.step alone
+    batched = erl_torch.collect(env, 3000, 500, 0)
+    direct = collect_rollouts("cart_pole", 3000, 500, 0)
+    assert all(np.array_equal(getattr(batched, name), getattr(direct, name)) for name in ("s", "a", "r", "s_next"))
+    assert (stepped.r == -1).sum() == 300
+    assert (batched.r == -1).sum() == 3000
+    lengths = [np.diff(np.flatnonzero(data.r == -1), prepend=-1) for data in (stepped, batched)]
     assert stats.ks_2samp(*lengths).pvalue > 1e-3
 
 
@@ -373,13 +376,25 @@ def test_torques_reach_the_original():
         assert cell == env.bins.cells(env.task.variables(batch.state)).item()
 
 
+def test_evaluation_plays_the_original():
+    """Batched figures of a policy against env.step: return, reward per step and objective agree (fixed seeds)."""
+    env = gym.make("erl_torch/DiscretePendulum-v0")
+    policy = np.random.default_rng(0).dirichlet(np.ones(3), 256)
+    batched = erl_torch.evaluate(env, policy, 1.0, np.random.default_rng(1), 400, 100)
+    plain = gym.wrappers.TransformReward(env, float)
+    stepped = erl_torch.evaluate(plain, policy, 1.0, np.random.default_rng(2), 400, 100)
+    assert batched.mean_return == pytest.approx(100 * batched.reward_per_step)
+    np.testing.assert_allclose(batched, stepped, rtol=0.1)
+    assert batched.objective < batched.reward_per_step
+
+
 def test_cyclic_reward_of_the_environments():
     env = gym.make("erl_torch/DiscreteCartPole-v0", reward="cyclic")
     env.reset(seed=0)
     rewards = [env.step(0)]
     while not rewards[-1][2]:
         rewards.append(env.step(0))
-    assert [r[1] for r in rewards] == [1.0] * (len(rewards) - 1) + [0.0]
+    assert [r[1] for r in rewards] == [0.0] * (len(rewards) - 1) + [-1.0]
 
 
 @pytest.mark.parametrize(

@@ -352,3 +352,29 @@ def test_exact_return_of_an_episode(tmp_path):
 )
 def test_environments_by_id(given, expected):
     assert cli._by_id(given, ROOT / "conf") == expected
+
+
+@pytest.mark.parametrize("stream", ["model", "episodes"])
+def test_control_tasks_are_learnt(tmp_path, monkeypatch, stream):
+    """Pendulum on few samples: the learnt policy's return in the original lies far above the prior's."""
+    monkeypatch.setenv("ERL_TORCH_CACHE", str(tmp_path / "cache"))
+    small = ("env.n_samples=50", "experience.n_episodes=4000", "evaluation.every=15", "evaluation.pictures=false")
+    result = train(composed("env=pendulum", f"env.stream={stream}", *small), tmp_path / "run")
+    returns = [event.value for event in events(tmp_path / "run").Scalars("eval/return")]
+    assert returns[-1] > returns[0] + 1000
+    assert (result["gap"] is None) == (stream == "episodes")
+    with pytest.raises(InputError, match=r"env\.stream=both: must be model or episodes"):
+        train(composed("env=pendulum", "env.stream=both"), tmp_path / "bad")
+
+
+def test_continuous_observations_are_binned(tmp_path):
+    common = ("env=gym", "env.id=MountainCar-v0", "experience.n_episodes=20", "evaluation.every=15")
+    result = train(composed(*common, "env.bins=6", "learner.beta=1"), tmp_path / "run")
+    assert Solution.load(tmp_path / "run" / "solution.npz").policy.shape == (36, 3)
+    assert result["status"] == "completed"
+    with pytest.raises(InputError, match=r"env\.low\[1\]=-?inf: must be finite: dimension 1"):
+        train(composed("env=gym", "env.id=CartPole-v1", "env.bins=6"), tmp_path / "bad")
+    with pytest.raises(InputError, match=r"observation_space=Box.* env\.bins"):
+        train(composed("env=gym", "env.id=CartPole-v1"), tmp_path / "bad")
+    with pytest.raises(InputError, match=r"env\.actions=None: must be a list of values"):
+        train(composed("env=gym", "env.id=Pendulum-v1", "env.bins=6"), tmp_path / "bad")

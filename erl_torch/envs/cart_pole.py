@@ -40,6 +40,7 @@ TASK = ControlTask(
     step=step,
     instant_reward=lambda state, step: torch.where(step.terminated, 0.0, step.reward),
     variables=lambda state: state,
+    max_reward=1.0,
 )
 
 
@@ -59,7 +60,7 @@ class DiscreteCartPoleEnv(ControlEnv):
     All four uniform in +-0.05.
 
     ## Rewards
-    1 a step, also for the step that fails. With `reward="cyclic"` 0 for that one.
+    1 a step, also for the step that fails. With `reward="cyclic"` 0 a step and -1 for that one.
 
     ## Episode End
     Terminates when the position leaves +-2.4 or the angle +-12 degrees. The registered environment truncates after

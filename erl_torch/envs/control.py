@@ -54,6 +54,7 @@ class ControlTask:
         variables: states [N, d] -> the variables that are binned, [N, d].
         features: one observation of the original -> these variables, [d]; None where they are equal.
         reset_dtype: precision in which the original draws its first state.
+        max_reward: the original's largest reward of a step.
     """
 
     name: str
@@ -71,6 +72,7 @@ class ControlTask:
     variables: Callable[[torch.Tensor], torch.Tensor]
     features: Callable[[np.ndarray], np.ndarray] | None = None
     reset_dtype: torch.dtype = torch.float64
+    max_reward: float = 0.0
 
     def initial(self, n: int, rng: np.random.Generator) -> torch.Tensor:
         """[n, d] first states, as the original draws them."""
@@ -128,8 +130,9 @@ class ControlEnv(gym.Env[np.int64, np.int64]):
     Args:
         task: the task.
         bins, low, high, actions: as in ``erl_torch.estimate_mdp``.
-        reward: "original", or "cyclic": 0 for the step that terminates. Learn from that one: some originals pay the
-            same for every step, so that a stream of episodes would not tell short from long.
+        reward: "original", or "cyclic": 0 for the step that terminates, all less the largest reward, so at most 0.
+            Learn from that one: some originals pay the same for every step, so that a stream of episodes would not
+            tell short from long.
         render_mode: the original's.
     """
 
@@ -170,8 +173,8 @@ class ControlEnv(gym.Env[np.int64, np.int64]):
 
     def step(self, action: np.int64) -> tuple[np.int64, float, bool, bool, dict[str, Any]]:
         cell, reward, terminated, truncated, info = self.env.step(action)
-        if terminated and self.reward == "cyclic":
-            reward = 0.0
+        if self.reward == "cyclic":
+            reward = (0.0 if terminated else reward) - self.task.max_reward
         return cell, reward, terminated, truncated, info
 
     def collect(self, n_episodes: int, episode_length: int, **arguments: Any) -> Transitions:

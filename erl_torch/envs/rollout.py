@@ -55,7 +55,7 @@ def rollout(
 
     Args:
         bins, actions: as ``ControlTask.uniform_bins`` and ``action_values`` give them; None is the task's own.
-        reward: "original", or "cyclic": 0 for the step that terminates.
+        reward: "original", or "cyclic" as in ``ControlEnv``.
 
     Raises:
         InputError: an argument out of range.
@@ -151,7 +151,9 @@ class _Player:
             # A number for every episode, running or not: an episode does not depend on the ends of others.
             a_next = self.draw(prior_cdf, s_next, rng.random(n)[episode])
             terminated = step.terminated.numpy()
-            reward = np.where(terminated & self.cyclic, 0.0, step.reward.numpy())
+            reward = step.reward.numpy()
+            if self.cyclic:
+                reward = np.where(terminated, 0.0, reward) - self.task.max_reward
             yield _Tick(episode, s, a, reward, s_next, a_next, terminated)
             taken = self.draw(behaviour_cdf, s_next, rng.random(n)[episode]) if apart else a_next
             state, s, a = step.state, s_next, taken
