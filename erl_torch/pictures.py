@@ -174,7 +174,7 @@ def _tiles(axes: Axes, grid: GridWorld) -> None:
     lines: dict[str, Any] = {"color": "#ffffff", "linewidth": 1.0, "zorder": 1}
     axes.hlines(np.arange(rows + 1) - 0.5, -0.5, cols - 0.5, **lines)
     axes.vlines(np.arange(cols + 1) - 0.5, -0.5, rows - 0.5, **lines)
-    _letters(axes, grid, "#777777", dark="#e8d5d5")
+    _letters(axes, grid, "#4a4a4a", dark="#e8d5d5")
 
 
 def _letters(axes: Axes, grid: GridWorld, colour: str, dark: str | None = None) -> None:

@@ -1,9 +1,10 @@
-"""Speed of sampling classic control, each figure beside Gymnasium's in one run.
+"""Speed of the environments, each figure beside Gymnasium's in one run.
 
-    python benchmarks/bench_control.py          all parts (about a minute)
-    python benchmarks/bench_control.py steps    steps/s of every task: env.step, our batched sampling, their ratio
-    python benchmarks/bench_control.py acrobot  the whole Acrobot model of Table S2: wall time, peak memory
-    python benchmarks/bench_control.py rollout  128 episodes of 500 steps in the original dynamics
+    python benchmarks/bench_envs.py          all parts (about a minute)
+    python benchmarks/bench_envs.py steps    steps/s of every task: env.step, our batched sampling, their ratio
+    python benchmarks/bench_envs.py acrobot  the whole Acrobot model of Table S2: wall time, peak memory
+    python benchmarks/bench_envs.py rollout  128 episodes of 500 steps in the original dynamics
+    python benchmarks/bench_envs.py mazes    1,000 random 30x30 mazes with their sparse models
 
 Sampling is everything behind a model: draw the state, step, bin, count. Of env.step only the step is timed, after the
 state is set by hand. CPU seconds of one thread; medians of interleaved rounds.
@@ -17,6 +18,7 @@ import statistics
 import subprocess
 import sys
 import time
+from collections import deque
 
 import gymnasium as gym
 import numpy as np
@@ -25,6 +27,7 @@ import torch
 from erl_torch import estimate_mdp, rollout
 from erl_torch.envs import CONTROL_TASKS
 from erl_torch.envs.control import ControlTask, control_task
+from erl_torch.envs.mazes import random_mazes
 
 FEW = 2000  # env.step's share of a round
 
@@ -94,8 +97,19 @@ def bench_rollout() -> None:
         print(f"| {task.gymnasium_id} | {statistics.median(seconds[1:]):.2f} | {played.lengths.sum():,} |")
 
 
+def bench_mazes() -> None:
+    deque(random_mazes(2), maxlen=0)  # compiles
+    tick = time.perf_counter()
+    mazes = list(random_mazes(1000, 30, density=0.25))
+    drawn = time.perf_counter()
+    for maze in mazes:
+        maze.mdp()
+    done = time.perf_counter()
+    print(f"\n1,000 mazes of 30x30: {drawn - tick:.1f} s, their sparse models {done - drawn:.1f} s, one core")
+
+
 if __name__ == "__main__":
     torch.set_num_threads(1)
-    parts = {"steps": bench_steps, "acrobot": bench_acrobot, "rollout": bench_rollout}
+    parts = {"steps": bench_steps, "acrobot": bench_acrobot, "rollout": bench_rollout, "mazes": bench_mazes}
     for part in [name for name in sys.argv[1:] if name in parts] or parts:
         parts[part]()
