@@ -376,6 +376,15 @@ def test_torques_reach_the_original():
         assert cell == env.bins.cells(env.task.variables(batch.state)).item()
 
 
+def test_a_policy_on_other_bins_is_played():
+    """The policy of a finer model solves the original; bins as in estimate_mdp."""
+    model = estimate_mdp("mountain_car", bins=16, n_samples=100, cache=False).mdp
+    best = erl_torch.solve_soft_bellman(model, 2.0).policy
+    played = [rollout("mountain_car", best, 64, 500, np.random.default_rng(0), bins=bins) for bins in (16, (16, 16))]
+    assert np.array_equal(played[0].returns, played[1].returns)
+    assert played[0].returns.mean() > -400  # the prior never gets there: -500
+
+
 def test_evaluation_plays_the_original():
     """Batched figures of a policy against env.step: return, reward per step and objective agree (fixed seeds)."""
     env = gym.make("erl_torch/DiscretePendulum-v0")

@@ -7,7 +7,7 @@ random numbers.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -47,14 +47,14 @@ def rollout(
     n_episodes: int,
     max_steps: int,
     rng: np.random.Generator,
-    bins: UniformBins | None = None,
+    bins: UniformBins | int | Sequence[int] | None = None,
     actions: tuple[float, ...] | None = None,
     reward: str = "original",
 ) -> Episodes:
     """Play ``n_episodes`` under ``policy`` [S, A] from the original's own first states.
 
     Args:
-        bins, actions: as ``ControlTask.uniform_bins`` and ``action_values`` give them; None is the task's own.
+        bins, actions: as in ``estimate_mdp``, or ``UniformBins`` with other bounds; None is the task's own.
         reward: "original", or "cyclic" as in ``ControlEnv``.
 
     Raises:
@@ -79,7 +79,7 @@ def collect_rollouts(
     seed: int | Streams = 0,
     behaviour_policy: Any = None,
     prior_policy: Any = None,
-    bins: UniformBins | None = None,
+    bins: UniformBins | int | Sequence[int] | None = None,
     actions: tuple[float, ...] | None = None,
     reward: str = "cyclic",
 ) -> Transitions:
@@ -114,10 +114,14 @@ def collect_rollouts(
 
 class _Player:
     def __init__(
-        self, task: str | ControlTask, bins: UniformBins | None, actions: tuple[float, ...] | None, reward: str
+        self,
+        task: str | ControlTask,
+        bins: UniformBins | int | Sequence[int] | None,
+        actions: tuple[float, ...] | None,
+        reward: str,
     ) -> None:
         self.task = control_task(task)
-        self.bins = bins or self.task.uniform_bins()
+        self.bins = bins if isinstance(bins, UniformBins) else self.task.uniform_bins(bins)
         self.values = torch.tensor(self.task.action_values(actions), dtype=torch.float64)
         checks.one_of("reward", reward, REWARDS)
         self.cyclic = reward == "cyclic"
