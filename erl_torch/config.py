@@ -69,6 +69,58 @@ class Exact:
 
 
 @dataclass
+class ActionValue:
+    """The arguments that the learners of action values share."""
+
+    beta: float = 10.0
+    power: float = 0.6
+    n_epochs: int = 15
+    prior_policy: str | None = None
+
+
+@dataclass
+class DifferentialSoftQ(ActionValue):
+    name: str = "differential_soft_q"
+    lr_rate: float | None = None
+
+
+@dataclass
+class RVISoftQ(ActionValue):
+    name: str = "rvi_soft_q"
+    reference: int | None = None
+
+
+@dataclass
+class ULearning(ActionValue):
+    name: str = "u_learning"
+    lr_rate: float | None = None
+
+
+@dataclass
+class ZLearning(ActionValue):
+    name: str = "z_learning"
+    lr_rate: float | None = None
+
+
+@dataclass
+class SoftQ(ActionValue):
+    name: str = "soft_q"
+    discount: float = 0.9
+
+
+@dataclass
+class QLearning(ActionValue):
+    name: str = "q_learning"
+    discount: float = 0.9
+
+
+@dataclass
+class Sarsa(ActionValue):
+    name: str = "sarsa"
+    discount: float = 0.9
+
+
+@dataclass
 class Simulate:
     name: str = "simulate"
     n_episodes: int = 500
@@ -105,7 +157,17 @@ class Train:
 
 SCHEMAS: dict[str, dict[str, type]] = {
     "env": {"windy_cliff": WindyCliff, "gym": Gym},
-    "learner": {"s1": S1, "exact": Exact},
+    "learner": {
+        "s1": S1,
+        "differential_soft_q": DifferentialSoftQ,
+        "rvi_soft_q": RVISoftQ,
+        "u_learning": ULearning,
+        "z_learning": ZLearning,
+        "soft_q": SoftQ,
+        "q_learning": QLearning,
+        "sarsa": Sarsa,
+        "exact": Exact,
+    },
     "experience": {"simulate": Simulate, "recorded": Recorded},
     "evaluation": {"standard": Standard},
 }

@@ -357,7 +357,7 @@ def _result(
         "status": solution.status.name.lower(),
         "message": solution.message,
         "theta": solution.theta,
-        "rho": solution.rho if 0 < solution.rho < np.inf else None,  # beyond double precision: theta tells
+        "rho": solution.rho if solution.rho and solution.rho < np.inf else None,  # beyond double precision: theta tells
         "reward_bias_max": solution.reward_bias_max,
         "reward_per_step": last.reward_per_step,
         "objective": last.objective,
