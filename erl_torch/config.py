@@ -155,6 +155,20 @@ class Train:
     evaluation: Any = MISSING
 
 
+@dataclass
+class Compare:
+    learners: list[str] = MISSING
+    seeds: int = 20
+    seed: int = 0
+    beta: float | None = None
+    prior_policy: str | None = None
+    n_sizes: int = 7
+    processes: int = 1
+    env: Any = MISSING
+    experience: Any = MISSING
+    learner: dict[str, Any] = MISSING
+
+
 SCHEMAS: dict[str, dict[str, type]] = {
     "env": {"windy_cliff": WindyCliff, "gym": Gym},
     "learner": {
@@ -193,6 +207,7 @@ def register() -> None:
         for name, schema in options.items():
             store.store(group=f"schema/{group}", name=name, node=schema)
     store.store(group="schema", name="train", node=Train)
+    store.store(group="schema", name="compare", node=Compare)
     OmegaConf.register_new_resolver("slug", slug, replace=True)
     OmegaConf.register_new_resolver("run_name", run_name, replace=True)
 
@@ -202,6 +217,17 @@ def check_keys(cfg: DictConfig) -> None:
     _check_node(cfg, Train, "")
     for group in SCHEMAS:
         _check_node(cfg[group], OmegaConf.get_type(cfg[group]), f"{group}.")
+
+
+def check_comparison_keys(cfg: DictConfig) -> None:
+    """``check_keys`` for ``conf/compare.yaml``: ``learner`` holds the settings of several, by name."""
+    _check_node(cfg, Compare, "")
+    for group in ("env", "experience"):
+        _check_node(cfg[group], OmegaConf.get_type(cfg[group]), f"{group}.")
+    for name in map(str, cfg.learner):
+        if name not in SCHEMAS["learner"]:
+            raise InputError(f"learner.{name}", "", f"left out: the learners are {', '.join(SCHEMAS['learner'])}")
+        _check_node(cfg.learner[name], SCHEMAS["learner"][name], f"learner.{name}.")
 
 
 def _check_node(node: DictConfig, schema: Any, prefix: str) -> None:

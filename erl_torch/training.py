@@ -59,10 +59,10 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
         print("compiling the loops, about ten seconds: on the first run only", file=sys.stderr)
     rng = streams(cfg.seed)
     _check_evaluation(cfg.evaluation)
-    env = _make_env(cfg.env)
+    env = make_env(cfg.env)
     with contextlib.closing(env):
         n_states, n_actions = sizes(env)
-        learner = _make_learner(cfg.learner, n_states, n_actions)
+        learner = make_learner(cfg.learner, n_states, n_actions)
         prior = check_policy("learner.prior_policy", learner.prior_policy, n_states, n_actions)
         run = (_Solving if isinstance(learner, Exact) else _Learning)(cfg, env, learner, rng, prior, safe_point)
 
@@ -264,7 +264,8 @@ def _group(name: str) -> Iterator[None]:
         raise error.within(name) from error
 
 
-def _make_env(cfg: DictConfig) -> gym.Env[Any, Any]:
+def make_env(cfg: DictConfig) -> gym.Env[Any, Any]:
+    """The environment of ``cfg``. Raises InputError."""
     if "kwargs" in cfg:
         arguments = {str(key): value for key, value in cfg.kwargs.items()}
     else:
@@ -278,9 +279,10 @@ def _make_env(cfg: DictConfig) -> gym.Env[Any, Any]:
             raise InputError("kwargs", arguments, f"arguments of {cfg.id} ({error})") from error
 
 
-def _make_learner(cfg: DictConfig, n_states: int, n_actions: int) -> Any:
+def make_learner(cfg: DictConfig, n_states: int, n_actions: int, key: str = "learner") -> Any:
+    """The learner of ``cfg``; complaints name their keys under ``key``."""
     learner_class = LEARNERS[cfg.name]
-    with _group("learner"):
+    with _group(key):
         arguments = {f.name: cfg[f.name] for f in fields(learner_class)}
         if cfg.prior_policy is not None:
             arguments["prior_policy"] = read_npy(cfg.prior_policy, "prior_policy")
