@@ -39,6 +39,8 @@ def run_comparison(cfg: DictConfig, directory: Path, safe_point: Callable[[], No
         raise InputError("experience", cfg.experience.name, "simulate: every seed needs a stream of its own")
     if cfg.experience.save_to is not None:
         raise InputError("experience.save_to", cfg.experience.save_to, "null: there is a stream a seed")
+    if not cfg.learners:
+        raise InputError("learners", "[]", "at least one")
     for name in cfg.learners:
         if not hasattr(LEARNERS.get(name), "fit"):
             able = " or ".join(name for name, learner in LEARNERS.items() if hasattr(learner, "fit"))

@@ -46,6 +46,7 @@ class Optimum(NamedTuple):
 
     theta: float  # reward a step
     policy: np.ndarray  # [S, A]
+    log_policy: np.ndarray  # [S, A], finite also where the policy underflows
     stationary: np.ndarray  # [S], of that policy
 
 
@@ -143,7 +144,12 @@ def compare(
     if not names:
         raise InputError("learners", "{}", "at least one")
     seeds = _seeds(seeds)
-    for key, value in (("n_sizes", n_sizes), ("processes", processes)):
+    for key, value in {
+        "n_episodes": n_episodes,
+        "episode_length": episode_length,
+        "n_sizes": n_sizes,
+        "processes": processes,
+    }.items():
         checks.at_least(key, value, 1)
     prior = check_policy("prior_policy", prior_policy, mdp.n_states, mdp.n_actions)
     beta = learners[names[0]].beta
@@ -182,17 +188,25 @@ def optimum(mdp: TabularMDP, beta: float, prior_policy: Any = None) -> Optimum:
             f"one with an exact solution ({solution.message or solution.status.value})",
         )
     assert solution.theta is not None
+    assert solution.action_value is not None
+    assert solution.value is not None
+    prior = check_policy("prior_policy", prior_policy, mdp.n_states, mdp.n_actions)
     policy = solution.policy.numpy()
-    return Optimum(solution.theta, policy, stationary_distribution(policy_chain(mdp, policy).transition, mdp.start))
+    log_policy = np.log(prior) + beta * (solution.action_value - solution.value[:, None]).numpy()
+    return Optimum(
+        solution.theta, policy, log_policy, stationary_distribution(policy_chain(mdp, policy).transition, mdp.start)
+    )
 
 
 def measure(mdp: TabularMDP, best: Optimum, solution: Solution, beta: float) -> dict[str, float]:
     """gap, kl, kl_states, theta_error and n_steps of one solution."""
     policy = solution.policy.detach().cpu().numpy()
     own = stationary_distribution(policy_chain(mdp, policy).transition, mdp.start)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        loss = np.where(policy > 0, policy * (np.log(policy) - best.log_policy), 0.0).sum(1)
     kl = kl_per_state(best.policy, policy)
     return {
-        "gap": _mean(own, kl_per_state(policy, best.policy)) / beta,
+        "gap": max(_mean(own, loss), 0.0) / beta,
         "kl": _mean(best.stationary, kl),
         "kl_states": float(kl.mean()),
         "theta_error": np.nan if solution.theta is None else abs(solution.theta - best.theta),

@@ -30,10 +30,9 @@ Steps need 1/2 < power <= 1 to converge; near 1 they forget too slowly what earl
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import ClassVar, TypeVar
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -45,8 +44,8 @@ from erl_torch.mdp import check_policy
 from erl_torch.solution import Solution, Status
 from erl_torch.transitions import Transitions
 
-_State = TypeVar("_State", bound="ActionValueState")
 BLOCK = 1 << 22  # tuples a compiled call, so that signals are served several times a second
+LARGEST = 1e300  # of beta |q|: differences must stay finite
 SOFT, GREEDY, ON_POLICY = 0, 1, 2  # backups, as the kernel has them
 
 
@@ -200,7 +199,15 @@ class ActionValueLearner:
         """One pass over the stream. Raises NonFiniteError."""
         q, visits = state.q.clone(), state.visits.clone()
         rate = self._pass(stream.pair, stream, state.prior_policy.numpy(), q.numpy(), visits.numpy(), state.rate or 0.0)
-        return self._checked(replace(state, q=q, visits=visits, rate=None if state.rate is None else rate), stream)
+        self._check(q, rate, state, stream)
+        return replace(
+            state,
+            epoch=state.epoch + 1,
+            n_tuples=state.n_tuples + len(stream.data),
+            q=q,
+            visits=visits,
+            rate=None if state.rate is None else rate,
+        )
 
     # -- its parts ------------------------------------------------------------------------------------
 
@@ -241,11 +248,13 @@ class ActionValueLearner:
             rate = kernels.action_value_epoch(pair[part], data.s_next[part], data.r[part], *settings, rate)
         return rate
 
-    def _checked(self, state: _State, stream: ActionValueStream) -> _State:
-        state = replace(state, epoch=state.epoch + 1, n_tuples=state.n_tuples + len(stream.data))
-        if not (torch.isfinite(state.q).all() and math.isfinite(state.rate or 0.0)):
-            raise NonFiniteError(state.n_tuples, "q or the reward rate overflows: scale the rewards down")
-        return state
+    def _check(self, table: torch.Tensor, rate: float, before: ActionValueState, stream: ActionValueStream) -> None:
+        largest = self.beta * max(float(table.abs().max()), abs(rate))
+        if not largest < LARGEST:  # also on NaN
+            raise NonFiniteError(
+                before.n_tuples + len(stream.data),
+                f"beta * q or beta * rate overflows at beta={self.beta:g}: scale the rewards down",
+            )
 
 
 @dataclass(frozen=True, eq=False)

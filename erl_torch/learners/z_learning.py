@@ -61,11 +61,20 @@ class ZLearning(_Average):
         """One pass over the stream, and the read-out. Raises NonFiniteError."""
         assert isinstance(state, ZState)
         value, visits = state.value.clone(), state.state_visits.clone()
-        tables = value.numpy()[:, None], visits.numpy()[:, None]
-        rate = self._pass(stream.data.s, stream, np.ones_like(tables[0]), *tables, state.rate or 0.0)
+        column, visits_column = value.numpy()[:, None], visits.numpy()[:, None]
+        rate = self._pass(stream.data.s, stream, np.ones_like(column), column, visits_column, state.rate or 0.0)
+        self._check(value, rate, state, stream)
         q, counts = _read_out(stream.pair, stream.data, value.numpy(), rate, self.beta, state.q.shape)
-        now = replace(state, q=q, visits=counts, value=value, state_visits=visits, rate=rate)
-        return self._checked(now, stream)
+        return replace(
+            state,
+            epoch=state.epoch + 1,
+            n_tuples=state.n_tuples + len(stream.data),
+            q=q,
+            visits=counts,
+            rate=rate,
+            value=value,
+            state_visits=visits,
+        )
 
 
 def _read_out(
