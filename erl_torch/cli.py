@@ -145,7 +145,7 @@ def _help(about: str, conf: Path, config_name: str, overrides: list[str]) -> str
     choices = [
         f"  {group.name}={{{','.join(sorted(option.stem for option in group.glob('*.yaml')))}}}"
         for group in sorted(conf.iterdir())
-        if group.is_dir()
+        if group.is_dir() and "name" in (cfg.get(group.name) or {})
     ]
     head = [about.rstrip(), "", "Choices:", *choices, "", "Keys and values (each is explained in conf/):", ""]
     return "\n".join(head) + "\n" + OmegaConf.to_yaml(cfg).rstrip()

@@ -153,6 +153,58 @@ class Exact:
 
 
 @dataclass
+class ActionValue:
+    """The arguments that the learners of action values share."""
+
+    beta: float = 10.0
+    power: float = 0.6
+    n_epochs: int = 15
+    prior_policy: str | None = None
+
+
+@dataclass
+class DifferentialSoftQ(ActionValue):
+    name: str = "differential_soft_q"
+    lr_rate: float | None = None
+
+
+@dataclass
+class RVISoftQ(ActionValue):
+    name: str = "rvi_soft_q"
+    reference: int | None = None
+
+
+@dataclass
+class ULearning(ActionValue):
+    name: str = "u_learning"
+    lr_rate: float | None = None
+
+
+@dataclass
+class ZLearning(ActionValue):
+    name: str = "z_learning"
+    lr_rate: float | None = None
+
+
+@dataclass
+class SoftQ(ActionValue):
+    name: str = "soft_q"
+    discount: float = 0.9
+
+
+@dataclass
+class QLearning(ActionValue):
+    name: str = "q_learning"
+    discount: float = 0.9
+
+
+@dataclass
+class Sarsa(ActionValue):
+    name: str = "sarsa"
+    discount: float = 0.9
+
+
+@dataclass
 class Simulate:
     name: str = "simulate"
     n_episodes: int = 500
@@ -188,6 +240,20 @@ class Train:
     evaluation: Any = MISSING
 
 
+@dataclass
+class Compare:
+    learners: list[str] = MISSING
+    seeds: int = 20
+    seed: int = 0
+    beta: float | None = None
+    prior_policy: str | None = None
+    n_sizes: int = 7
+    processes: int = 1
+    env: Any = MISSING
+    experience: Any = MISSING
+    learner: dict[str, Any] = MISSING
+
+
 SCHEMAS: dict[str, dict[str, type]] = {
     "env": {
         "windy_cliff": WindyCliff,
@@ -201,7 +267,17 @@ SCHEMAS: dict[str, dict[str, type]] = {
         "mdp": Mdp,
         "gym": Gym,
     },
-    "learner": {"s1": S1, "exact": Exact},
+    "learner": {
+        "s1": S1,
+        "differential_soft_q": DifferentialSoftQ,
+        "rvi_soft_q": RVISoftQ,
+        "u_learning": ULearning,
+        "z_learning": ZLearning,
+        "soft_q": SoftQ,
+        "q_learning": QLearning,
+        "sarsa": Sarsa,
+        "exact": Exact,
+    },
     "experience": {"simulate": Simulate, "recorded": Recorded},
     "evaluation": {"standard": Standard},
 }
@@ -227,6 +303,7 @@ def register() -> None:
         for name, schema in options.items():
             store.store(group=f"schema/{group}", name=name, node=schema)
     store.store(group="schema", name="train", node=Train)
+    store.store(group="schema", name="compare", node=Compare)
     OmegaConf.register_new_resolver("slug", slug, replace=True)
     OmegaConf.register_new_resolver("run_name", run_name, replace=True)
 
@@ -234,6 +311,15 @@ def register() -> None:
 def check_keys(cfg: DictConfig) -> None:
     """Raise InputError for a key that no schema has, and for one that has no value."""
     _check_node(cfg, Train, "")
+
+
+def check_comparison_keys(cfg: DictConfig) -> None:
+    """``check_keys`` for ``conf/compare.yaml``: ``learner`` holds the settings of several, by name."""
+    _check_node(cfg, Compare, "")
+    for name in map(str, cfg.learner):
+        if name not in SCHEMAS["learner"]:
+            raise InputError(f"learner.{name}", "", f"left out: the learners are {', '.join(SCHEMAS['learner'])}")
+        _check_node(cfg.learner[name], SCHEMAS["learner"][name], f"learner.{name}.")
 
 
 def _check_node(node: DictConfig, schema: Any, prefix: str) -> None:

@@ -15,11 +15,13 @@ import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 
 from erl_torch import kernels
-from erl_torch.chains import RegenerativeLU, classes
+from erl_torch.chains import RegenerativeLU, SingularChainError, classes
 from erl_torch.experience import batched, policy_cdf, reset, sampling_tables
 from erl_torch.mdp import TabularMDP, check_policy
 from erl_torch.models import known_mdp, sizes
 from erl_torch.rng import Streams
+
+DENSE_STATES = 2000  # up to here a nearly reducible chain is solved densely: seconds, 32 MB
 
 
 class Evaluation(NamedTuple):
@@ -81,8 +83,21 @@ def stationary_distribution(transition: sp.csr_array, start: np.ndarray) -> np.n
         inside = label == c
         mass = inflow[inside].sum()
         if mass > 0:
-            share[inside] = mass * RegenerativeLU.adapted(sp.csr_array(chain[inside][:, inside]), 0).stationary()
+            share[inside] = mass * _stationary(sp.csr_array(chain[inside][:, inside]))
     return share
+
+
+def _stationary(chain: sp.csr_array) -> np.ndarray:
+    """Of one closed class. Parts of it may be all but closed: more than differences in double precision can tell."""
+    try:
+        return RegenerativeLU.adapted(chain, 0).stationary()
+    except SingularChainError:
+        if chain.shape[0] > DENSE_STATES:
+            raise
+        share = np.asarray(kernels.gth(chain.toarray()))
+        if not np.isfinite(share).all():  # products of probabilities underflow
+            raise
+        return share
 
 
 def induced_distribution(mdp: TabularMDP, policy: np.ndarray, horizon: int | None = None) -> np.ndarray:

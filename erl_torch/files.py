@@ -54,6 +54,13 @@ def write_json(path: str | os.PathLike[str], value: Mapping[str, Any]) -> Path:
     return _write(path, fill)
 
 
+def write_png(path: str | os.PathLike[str], pixels: np.ndarray) -> Path:
+    """Write an image [H, W, 3] uint8."""
+    from matplotlib.image import imsave
+
+    return _write(path, lambda file: imsave(file, pixels, format="png", metadata={"Software": ""}))
+
+
 def read_npz(path: str | os.PathLike[str], key: str = "path") -> dict[str, np.ndarray]:
     """All arrays of an npz file, without pickle.
 

@@ -304,6 +304,33 @@ def finite_horizon_return(indptr, indices, data, reward, start, horizon):
     return total
 
 
+@numba.njit(cache=True, error_model="numpy")
+def gth(p):
+    """Stationary distribution [S] of one closed class, dense p [S, S] (destroyed), without a subtraction.
+
+    Grassmann, Taksar, Heyman (1985): every component to nearly full relative accuracy, however rarely the
+    chain moves between its parts.
+    """
+    n = p.shape[0]
+    for k in range(n - 1, 0, -1):
+        out = 0.0
+        for j in range(k):
+            out += p[k, j]
+        for i in range(k):
+            p[i, k] /= out
+            weight = p[i, k]
+            if weight > 0.0:
+                for j in range(k):
+                    p[i, j] += weight * p[k, j]
+    x = np.zeros(n)
+    x[0] = 1.0
+    for k in range(1, n):
+        for i in range(k):
+            x[k] += x[i] * p[i, k]
+        x[: k + 1] /= np.max(x[: k + 1])
+    return x / np.sum(x)
+
+
 # ---------------------------------------------------------------------------------------------------
 # Random mazes
 # ---------------------------------------------------------------------------------------------------
@@ -405,3 +432,91 @@ def count_rows(cells, n_cells):
             seen[indices[m]] = 0
         length[row] = n - first
     return length, indices[:n].copy(), counts[:n].copy()
+
+
+# ---------------------------------------------------------------------------------------------------
+# Learners of action values: Q-learning and its kin
+# ---------------------------------------------------------------------------------------------------
+
+
+@numba.njit(cache=True, error_model="numpy")
+def backed_up(q, visits, prior, beta, first, last, backup):
+    """V of the state whose pairs are first..last; pairs without visits are left out, and V = 0 where all are.
+
+    ``backup`` 0: (1/beta) log sum_a prior exp(beta q); 1: max_a q; 2: sum_a pi q with pi ~ prior exp(beta q).
+    The prior is that of the pairs with visits, normalised.
+    """
+    top = -np.inf
+    for k in range(first, last):
+        if visits[k] > 0 and q[k] > top:
+            top = q[k]
+    if top == -np.inf:
+        return 0.0
+    if backup == 1:
+        return top
+    mass = 0.0
+    total = 0.0
+    average = 0.0
+    for k in range(first, last):
+        if visits[k] > 0:
+            weight = prior[k] * math.exp(beta * (q[k] - top))
+            mass += prior[k]
+            total += weight
+            average += weight * (q[k] - top)
+    if backup == 2:
+        return top + average / total
+    return top + math.log(total / mass) / beta
+
+
+@numba.njit(cache=True, error_model="numpy")
+def log_mix(x, step):
+    """log(1 - step + step exp(x)) for any x and 0 < step <= 1."""
+    if x > 0.0:
+        return x + math.log1p((1.0 - step) * math.expm1(-x))
+    if step == 1.0:
+        return x
+    return math.log1p(step * math.expm1(x))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def action_value_epoch(
+    pair,
+    s_next,
+    reward,
+    prior,
+    n_actions,
+    beta,
+    discount,
+    backup,
+    exponential,
+    power,
+    lr_rate,
+    reference,
+    q,
+    visits,
+    rate,
+):
+    """One pass: q(s,a) moves towards r - rate + discount V(s') by the step n(s,a)**-power.
+
+    ``exponential``: what is averaged is exp(beta q). ``lr_rate``: step size of the rate relative to that of q;
+    ``reference`` >= 0: the rate is V of that state. q and visits [n_pairs] change in place; returns the rate.
+    """
+    for t in range(pair.size):
+        k = pair[t]
+        first = s_next[t] * n_actions
+        value = backed_up(q, visits, prior, beta, first, first + n_actions, backup)
+        visits[k] += 1
+        step = float(visits[k]) ** -power
+        error = reward[t] - rate + discount * value - q[k]
+        if exponential:
+            change = log_mix(beta * error, step) / beta
+            # As line 11 of Algorithm S1: the ratio of the target to the new u is at most 1 / step.
+            rate += log_mix(beta * (error - change), lr_rate * step) / beta
+        else:
+            change = step * error
+            rate += lr_rate * change
+        q[k] += change
+        if reference >= 0 and k // n_actions == reference:
+            first = reference * n_actions
+            rate = backed_up(q, visits, prior, beta, first, first + n_actions, backup)
+    return rate

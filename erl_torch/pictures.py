@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,9 @@ TILE_COLOURS = {
 ARROW = "#1b4f9c"
 WIND = "#b9c6d3"
 SHARE = "#f08c00"
+# Okabe and Ito's, told apart with any colour vision, and three more.
+COLOURS = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#222222", "#7b3294", "#8c6d31", "#9a9a9a"]
+MARKERS = "os^"
 
 
 def policy_picture(
@@ -110,6 +114,67 @@ def table_picture(table: np.ndarray, title: str, label: str, max_px: int = MAX_P
     axes.set_title(title, fontsize=9)
     _bar(figure, image, label)
     return _pixels(figure)
+
+
+def learning_curves(sizes: Sequence[int], curves: Mapping[str, Sequence[Mapping[str, Any]]], title: str) -> np.ndarray:
+    """Gap against tuples of experience, log-log; ``curves`` as ``Comparison.summary`` has them.
+
+    Lines are interquartile means, bands their bootstrap intervals; names stand at the right ends.
+    """
+    figure = Figure(figsize=(8.4, 5.0), dpi=150)
+    axes = figure.add_axes((0.095, 0.115, 0.66, 0.77))
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    ends = []
+    for i, (name, points) in enumerate(curves.items()):
+        # A gap of 0 is a policy exact to rounding; a failed seed has no figure.
+        shown = [(n, point) for n, point in zip(sizes, points, strict=True) if point["iqm"]]
+        if not shown:
+            continue
+        colour, marker = COLOURS[i % len(COLOURS)], MARKERS[i // len(COLOURS) % len(MARKERS)]
+        x, y = [n for n, _ in shown], [point["iqm"] for _, point in shown]
+        axes.plot(x, y, marker, color=colour, linestyle="-", linewidth=1.8, markersize=4, zorder=3, clip_on=False)
+        bands = [(n, *point["interval"]) for n, point in shown if point["interval"]]
+        if bands:
+            at, low, high = np.array(bands).T
+            axes.fill_between(at, np.maximum(low, 1e-300), high, color=colour, alpha=0.18, linewidth=0, zorder=2)
+        ends.append((y[-1], name, colour))
+    axes.grid(True, which="major", color="#dddddd", linewidth=0.8, zorder=0)
+    axes.set_axisbelow(True)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    axes.tick_params(which="both", colors="#444444", labelsize=9)
+    axes.set_xlabel("tuples of experience", fontsize=10)
+    axes.set_ylabel("gap  g* \u2212 J,  reward a step", fontsize=10)
+    axes.set_xlim(sizes[0] / 1.15 if len(sizes) > 1 else sizes[0] / 2, sizes[-1])
+    figure.text(0.095, 0.945, title, fontsize=11, weight="bold")
+    figure.text(0.095, 0.908, "interquartile mean over seeds, bootstrap 95 % band", fontsize=8.5, color="#666666")
+    _name_ends(axes, sorted(ends))
+    return _pixels(figure)
+
+
+def _name_ends(axes: Axes, ends: list[tuple[float, str, str]]) -> None:
+    """Names right of the axes at the heights of the curves' ends, moved apart where they would overlap."""
+    if not ends:
+        return
+    height = axes.transData.transform
+    bottom, top = (axes.transAxes.transform((0, y))[1] for y in (0, 1))
+    at = np.array([(height((1, y))[1] - bottom) / (top - bottom) for y, _, _ in ends])
+    apart = min(0.05, 1 / len(at))
+    room = apart * np.arange(len(at))
+    # Least squares with a least distance: pool neighbours whose wishes cross.
+    pools: list[list[float]] = []
+    for wish in at - room:
+        pools.append([wish])
+        while len(pools) > 1 and np.mean(pools[-2]) > np.mean(pools[-1]):
+            pools[-2:] = [pools[-2] + pools[-1]]
+    placed = np.concatenate([np.full(len(pool), np.mean(pool)) for pool in pools])
+    placed = np.clip(placed, 0.0, max(0.0, 1.0 - room[-1])) + room
+    for y, wish, (_, name, colour) in zip(placed, at, ends, strict=True):
+        axes.plot(
+            [1.0, 1.035], [wish, y], color=colour, linewidth=0.9, transform=axes.transAxes, clip_on=False, zorder=3
+        )
+        axes.text(1.045, y, name, color=colour, fontsize=9, weight="bold", va="center", transform=axes.transAxes)
 
 
 def board(grid: GridWorld, cell_px: int = 64) -> np.ndarray:

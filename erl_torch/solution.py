@@ -32,18 +32,19 @@ class Status(enum.Enum):
     NON_FINITE = "a table left the positive finite numbers; the tables are those of the last good epoch"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Solution:
     """A policy with the tables and the record behind it (symbols as in ``erl_torch.learners.algorithm_s1``).
 
-    ``history`` has one array a logged quantity, one entry an epoch.
+    ``history`` has one array a logged quantity, one entry an epoch. theta and rho are None where the learner
+    estimates neither (discounted learners).
     """
 
     policy: torch.Tensor  # [S, A], rows sum to 1
     u: torch.Tensor  # [S, A] > 0, mean 1
     psi: torch.Tensor  # [S] > 0, 1 / sum_a prior(a|s) u(s,a)
-    rho: float
-    theta: float  # reward a step; -theta is the regularised reward rate
+    rho: float | None = None
+    theta: float | None = None  # reward a step; -theta is the regularised reward rate
     reward_bias: torch.Tensor  # [S, A] >= 0, reward a step
     reward_bias_max: float
     n_steps: int  # tuples streamed through the u updates
@@ -62,11 +63,40 @@ class Solution:
 
         Q = -theta N + log(u)/beta, V = -theta N + log(sum_a prior u)/beta.
         """
+        if self.theta is None and n_steps:
+            raise ValueError("value_functions needs theta, which this solution does not carry")
+        total = self.theta * n_steps if self.theta is not None else 0.0
         if self.action_value is not None and self.value is not None:
-            return self.action_value - self.theta * n_steps, self.value - self.theta * n_steps
+            return self.action_value - total, self.value - total
         if self.beta is None:
             raise ValueError("value_functions needs beta, which this solution does not carry")
-        return self.u.log() / self.beta - self.theta * n_steps, -self.psi.log() / self.beta - self.theta * n_steps
+        return self.u.log() / self.beta - total, -self.psi.log() / self.beta - total
+
+    @classmethod
+    def of_action_values(
+        cls, q: torch.Tensor, prior_policy: torch.Tensor, beta: float, theta: float | None, **others: Any
+    ) -> Solution:
+        """The solution of the policy ~ prior exp(beta q), q [S, A], with V = (1/beta) log sum_a prior exp(beta q).
+
+        Both are shifted so that their maximum is 0; ``others`` are fields as they stand.
+        """
+        logits = beta * q + prior_policy.log()
+        value = logits.logsumexp(1) / beta
+        shift = torch.maximum(q.max(), value.max())
+        q, value = q - shift, value - shift
+        return cls(
+            policy=torch.softmax(logits, 1),
+            u=(beta * q).exp(),
+            psi=(-beta * value).exp(),
+            rho=None if theta is None else float(np.exp(np.clip(-beta * theta, -700, 700))),
+            theta=theta,
+            reward_bias=torch.zeros_like(q),
+            reward_bias_max=0.0,
+            beta=beta,
+            value=value,
+            action_value=q,
+            **others,
+        )
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write everything to an npz file; the history's arrays are named ``history/...``."""

@@ -65,7 +65,7 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
         print("compiling the loops, about ten seconds: on the first run only", file=sys.stderr)
     rng = streams(cfg.seed)
     _check_evaluation(cfg.evaluation)
-    env = _make_env(cfg.env)
+    env = make_env(cfg.env)
     with contextlib.closing(env):
         world = _world(cfg.env, env, safe_point)
         judge = world.mdp
@@ -73,7 +73,7 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
             judge = None
             print("note: a large model (evaluation.exact_up_to): episodes are played instead", file=sys.stderr)
         n_states, n_actions = sizes(env)
-        learner = _make_learner(cfg.learner, n_states, n_actions)
+        learner = make_learner(cfg.learner, n_states, n_actions)
         prior = check_policy("learner.prior_policy", learner.prior_policy, n_states, n_actions)
         run = (_Solving if isinstance(learner, Exact) else _Learning)(cfg, world, learner, rng, prior, safe_point)
 
@@ -289,7 +289,8 @@ def _group(name: str) -> Iterator[None]:
         raise error.within(name) from error
 
 
-def _make_env(cfg: DictConfig) -> gym.Env[Any, Any]:
+def make_env(cfg: DictConfig) -> gym.Env[Any, Any]:
+    """The environment of ``cfg``. Raises InputError."""
     keys: Any = OmegaConf.to_container(cfg, resolve=True)
     arguments = keys["kwargs"] if "kwargs" in keys else {k: v for k, v in keys.items() if k not in NOT_ARGUMENTS}
     with _group("env"):
@@ -361,9 +362,10 @@ def _mean_return(episode: TabularMDP, horizon: int, policy: np.ndarray) -> float
     return horizon * reward_per_step(episode, policy, horizon)
 
 
-def _make_learner(cfg: DictConfig, n_states: int, n_actions: int) -> Any:
+def make_learner(cfg: DictConfig, n_states: int, n_actions: int, key: str = "learner") -> Any:
+    """The learner of ``cfg``; complaints name their keys under ``key``."""
     learner_class = LEARNERS[cfg.name]
-    with _group("learner"):
+    with _group(key):
         arguments = {f.name: cfg[f.name] for f in fields(learner_class)}
         if cfg.prior_policy is not None:
             arguments["prior_policy"] = read_npy(cfg.prior_policy, "prior_policy")
@@ -440,7 +442,7 @@ def _result(
         "status": solution.status.name.lower(),
         "message": solution.message,
         "theta": solution.theta,
-        "rho": solution.rho if 0 < solution.rho < np.inf else None,  # beyond double precision: theta tells
+        "rho": solution.rho if solution.rho and solution.rho < np.inf else None,  # beyond double precision: theta tells
         "reward_bias_max": solution.reward_bias_max,
         "reward_per_step": last.reward_per_step,
         "objective": last.objective,

@@ -47,6 +47,10 @@ class Transitions:
     def __len__(self) -> int:
         return len(self.s)
 
+    def first(self, n: int) -> Transitions:
+        """The first ``n`` tuples."""
+        return Transitions(*(getattr(self, field.name)[:n] for field in fields(self)))
+
     def check_range(self, n_states: int, n_actions: int) -> None:
         """Raise InputError naming the first tuple with a state or action out of range."""
         for name, bound in (("s", n_states), ("a", n_actions), ("s_next", n_states), ("a_next", n_actions)):

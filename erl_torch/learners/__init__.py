@@ -5,9 +5,44 @@
 
 from typing import Any
 
+from erl_torch.learners.action_value import (
+    ActionValueState,
+    DifferentialSoftQ,
+    QLearning,
+    RVISoftQ,
+    Sarsa,
+    SoftQ,
+    ULearning,
+)
 from erl_torch.learners.algorithm_s1 import AlgorithmS1, NonFiniteError, S1State
 from erl_torch.learners.exact import Exact, ExactState
+from erl_torch.learners.z_learning import ZLearning
 
-LEARNERS: dict[str, Any] = {"s1": AlgorithmS1, "exact": Exact}
+LEARNERS: dict[str, Any] = {
+    "s1": AlgorithmS1,
+    "differential_soft_q": DifferentialSoftQ,
+    "rvi_soft_q": RVISoftQ,
+    "u_learning": ULearning,
+    "z_learning": ZLearning,
+    "soft_q": SoftQ,
+    "q_learning": QLearning,
+    "sarsa": Sarsa,
+    "exact": Exact,
+}
 
-__all__ = ["LEARNERS", "AlgorithmS1", "Exact", "ExactState", "NonFiniteError", "S1State"]
+__all__ = [
+    "LEARNERS",
+    "ActionValueState",
+    "AlgorithmS1",
+    "DifferentialSoftQ",
+    "Exact",
+    "ExactState",
+    "NonFiniteError",
+    "QLearning",
+    "RVISoftQ",
+    "S1State",
+    "Sarsa",
+    "SoftQ",
+    "ULearning",
+    "ZLearning",
+]
