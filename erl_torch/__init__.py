@@ -13,9 +13,12 @@ import erl_torch.envs  # noqa: F401  (registers the environments)
 
 if TYPE_CHECKING:
     from erl_torch.checks import InputError
+    from erl_torch.empirical import EmpiricalMDP, empirical_mdp
     from erl_torch.evaluation import Evaluation, evaluate
     from erl_torch.experience import collect
     from erl_torch.learners.algorithm_s1 import AlgorithmS1, NonFiniteError, S1State
+    from erl_torch.learners.certainty_equivalence import CertaintyEquivalence
+    from erl_torch.learners.efficient_s1 import EfficientS1
     from erl_torch.mdp import TabularMDP
     from erl_torch.solution import Solution, Status
     from erl_torch.solvers import certify, iterate_biasing, perron, solve_biasing, solve_soft_bellman
@@ -25,6 +28,9 @@ __version__ = "0.1.0"
 
 _HOME = {
     "AlgorithmS1": "learners.algorithm_s1",
+    "CertaintyEquivalence": "learners.certainty_equivalence",
+    "EfficientS1": "learners.efficient_s1",
+    "EmpiricalMDP": "empirical",
     "Evaluation": "evaluation",
     "InputError": "checks",
     "NonFiniteError": "learners.algorithm_s1",
@@ -39,11 +45,15 @@ _HOME = {
     "TabularMDP": "mdp",
     "Transitions": "transitions",
     "collect": "experience",
+    "empirical_mdp": "empirical",
     "evaluate": "evaluation",
 }
 
 __all__ = [
     "AlgorithmS1",
+    "CertaintyEquivalence",
+    "EfficientS1",
+    "EmpiricalMDP",
     "Evaluation",
     "InputError",
     "NonFiniteError",
@@ -54,6 +64,7 @@ __all__ = [
     "Transitions",
     "certify",
     "collect",
+    "empirical_mdp",
     "evaluate",
     "iterate_biasing",
     "perron",
