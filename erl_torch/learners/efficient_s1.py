@@ -20,11 +20,11 @@ Options, each alone (published: all off, ``unvisited="initial"``; then this *is*
                             them lr_psi, psi_tol and max_psi_epochs go. Off: lines 2-3.
     2. ``expected_backup``  y(s') above in place of u(s',a') psi(s'). a' is not used, so any behaviour policy with
                             support will do; off, a' must be a draw from the prior at s'.
-    3. ``clocks``           a_n = max(lr_u, h/(h + n)), n earlier visits of (s,a) in this biasing iteration, h =
-                            ``clock_horizon``: what n visits leave of the start is (n/h)^-h, and a pair that is seen
-                            once a pass is at its value after a few. lr_rho falls as lr_rho/(epoch of the iteration).
-                            The floor lets z fall by any number of decades; the noise it would leave vanishes with
-                            that of the backup. Off: a_n = lr_u, lr_rho.
+    3. ``clocks``           a_n = max(clock_floor, h/(h + n)), n earlier visits of (s,a) in this biasing iteration,
+                            h = ``clock_horizon``: what n visits leave of the start is (n/h)^-h, and a pair that is
+                            seen once a pass is at its value after a few. lr_rho falls as lr_rho/(epoch of the
+                            iteration). The floor lets z fall by any number of decades, and far states mix; the noise
+                            it would leave vanishes with that of the backup. Off: a_n = lr_u, lr_rho.
     4. ``mean_reward``      r(s,a) is the mean over all visits. Off: each tuple's own r, that is an average of
                             exp(beta r), optimistic about noise in r.
     5. ``warm_start``       u and theta are carried over to the next biasing iteration (rho = exp(-beta (theta +
@@ -117,12 +117,9 @@ class EfficientState:
     @property
     def u(self) -> torch.Tensor:
         """[S, A], mean 1; 0 on pairs that take no part, or below double precision."""
-        u = torch.where(self.weight > 0, (self._log_u - self._log_u.max()).exp(), torch.zeros_like(self.weight))
+        log_u = self.log_average - self.log_psi_in_use[:, None]
+        u = (log_u - log_u.max()).exp() * (self.weight > 0)
         return u / u.mean()
-
-    @property
-    def _log_u(self) -> torch.Tensor:
-        return self.log_average - self.log_psi_in_use[:, None]
 
     @property
     def psi(self) -> torch.Tensor:
@@ -160,6 +157,7 @@ class EfficientStream:
     model: EmpiricalMDP
     part: EmpiricalProblem
     weight: torch.Tensor  # [S, A]
+    inside: np.ndarray  # [S, A] bool: pairs of the problem; u = 1 elsewhere
     visited: np.ndarray  # [n_visited], pairs in the stream
     psi_rows: tuple[np.ndarray, np.ndarray, np.ndarray]  # CSR, rows of the visited pairs that sum to 1
     log_keep: np.ndarray  # [n_visited], log of what an epoch of lines 2-3 leaves of the old value; -inf: nothing
@@ -172,13 +170,13 @@ class EfficientS1:
 
     Args:
         beta: inverse temperature, 1/reward, > 0.
-        lr_u, lr_rho: step sizes in (0, 1]: constant without ``clocks``, else floor and start; lr_rho None is
-            lr_u / n_states.
-        n_epochs: passes over the stream a biasing iteration.
+        lr_u, lr_rho: step sizes in (0, 1]; lr_rho None is lr_u / n_states. With ``clocks``, lr_u counts for nothing
+            else.
+        n_epochs: passes over the stream a biasing iteration. Short ones serve best where u is carried over.
         n_bias: biasing iterations at most, the unbiased first included.
         prior_policy: [S, A], every entry > 0; None is uniform.
         tol: width at which the certificate ends the run, relative to the range of the rewards.
-        clock_horizon: h of the clocks, >= 1.
+        clock_horizon, clock_floor: of the clocks; h >= 1, floor in (0, 1].
         lr_psi, psi_tol, max_psi_epochs: of lines 2-3, without ``sample_mean_psi``.
         sample_mean_psi, expected_backup, clocks, mean_reward, warm_start, polyak, log_domain, certificate, unvisited:
             the options.
@@ -190,11 +188,12 @@ class EfficientS1:
     beta: float = 10.0
     lr_u: float = 0.005
     lr_rho: float | None = None
-    n_epochs: int = 15
-    n_bias: int = 6
+    n_epochs: int = 3
+    n_bias: int = 30
     prior_policy: torch.Tensor | np.ndarray | None = None
     tol: float = 1e-7
     clock_horizon: float = 10.0
+    clock_floor: float = 0.05
     lr_psi: float = 0.1
     psi_tol: float = 1e-4
     max_psi_epochs: int = 10_000
@@ -218,6 +217,7 @@ class EfficientS1:
         checks.positive("tol", self.tol)
         if not (checks.is_number(self.clock_horizon) and 1 <= self.clock_horizon < math.inf):
             raise InputError("clock_horizon", self.clock_horizon, "a finite number >= 1")
+        checks.step_size("clock_floor", self.clock_floor)
         checks.step_size("lr_psi", self.lr_psi)
         checks.positive("psi_tol", self.psi_tol)
         checks.at_least("max_psi_epochs", self.max_psi_epochs, 1)
@@ -228,7 +228,8 @@ class EfficientS1:
     def published(cls, **options: object) -> EfficientS1:
         """Every option at the paper's value, unless given: Algorithm S1 itself."""
         off: dict[str, object] = dict.fromkeys(SWITCHES, False)
-        return cls(**(off | {"log_domain": "off", "unvisited": "initial"} | options))  # type: ignore[arg-type]
+        paper: dict[str, object] = {"log_domain": "off", "unvisited": "initial", "n_epochs": 15, "n_bias": 6}
+        return cls(**(off | paper | options))  # type: ignore[arg-type]
 
     # -- the whole run ------------------------------------------------------------------------------
 
@@ -354,6 +355,7 @@ class EfficientS1:
             model=model,
             part=part,
             weight=torch.from_numpy(weight),
+            inside=part.used if self.unvisited == "exclude" else np.ones_like(part.used),
             visited=visited,
             psi_rows=(np.append(indptr[visited], len(values)), indices, values),
             log_keep=log_keep,
@@ -371,14 +373,17 @@ class EfficientS1:
             state = self._new_biases(replace(state, weight=stream.weight), stream)
         log_z, log_total, log_rho = self._u_epoch(state, stream)
         log_average = log_z
+        inside, log_psi = stream.inside, state.log_psi_in_use.numpy()[:, None]
         window = state.epoch + 1 - self.n_epochs // 2  # epochs in the mean
         if self.polyak and window > 0:
             n = stream.model.visits * window
             log_average = np.where(n > 0, log_total - np.log(np.maximum(n, 1)), log_z)
         with np.errstate(divide="ignore"):
             log_weight = np.log(state.weight.numpy())
-        log_u = log_average - state.log_psi_in_use.numpy()[:, None]
-        log_u -= logsumexp(np.where(np.isfinite(log_weight), log_u, -np.inf)) - math.log(log_u.size)
+        log_u = log_average - log_psi
+        log_u -= logsumexp(log_u[inside]) - math.log(inside.sum())
+        log_u = np.where(inside, log_u, 0.0)
+        log_average = log_u + log_psi
         after = replace(
             state,
             epoch=state.epoch + 1,
@@ -439,16 +444,17 @@ class EfficientS1:
         """The step of a pair's n-th visit in a biasing iteration, n = 0, 1, ...; the last entry stays."""
         if not self.clocks:
             return np.array([self.lr_u])
-        n_falling = math.ceil(self.clock_horizon * (1 / self.lr_u - 1))
-        return np.maximum(self.lr_u, self.clock_horizon / (self.clock_horizon + np.arange(n_falling + 1)))
+        n_falling = math.ceil(self.clock_horizon * (1 / self.clock_floor - 1))
+        return np.maximum(self.clock_floor, self.clock_horizon / (self.clock_horizon + np.arange(n_falling + 1)))
 
     def _u_epoch(self, state: EfficientState, stream: EfficientStream) -> tuple[np.ndarray, np.ndarray, float]:
         """(log z, log total, log rho) after an epoch of lines 9-11."""
         reward = 0.0 if stream.noisy else stream.model.reward
         log_g = self.beta * (reward - state.reward_bias_max) - state.mean_log_psi.numpy()
         log_g += state.log_psi_in_use.numpy()[:, None]
-        top = float(state.log_z.max())
-        log_z, log_total = state.log_z.numpy() - top, state.log_total.numpy() - top
+        top = state.log_z.numpy()[stream.inside].max()
+        log_z, log_total = np.where(stream.inside, state.log_z - top, 0.0), state.log_total.numpy() - top
+        log_g = np.where(stream.inside, log_g, 0.0)
         span = max(np.abs(log_g).max(), np.abs(stream.log_factor).max(), -log_z.min(), abs(state.log_rho))
         with np.errstate(all="ignore"):
             if self.log_domain == "off" or (self.log_domain == "auto" and span < SAFE_RANGE):
