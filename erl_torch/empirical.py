@@ -101,7 +101,9 @@ class EmpiricalMDP:
             inside = label == np.argmax(tuples)
             used &= inside[:, None]
             entries &= inside[pair_of // n_actions]
-            message = f"{closed.sum()} closed sets of states in this stream; solved on {_name(inside)}, the most visited"
+            message = (
+                f"{closed.sum()} closed sets of states in this stream; solved on {_name(inside)}, the most visited"
+            )
         return used, entries, message, bool(closed.sum() > 1)
 
 
@@ -142,7 +144,9 @@ def empirical_mdp(transitions: Transitions, n_states: int, n_actions: int) -> Em
     squares = np.bincount(pair, (transitions.r - reward[pair]) ** 2, n_pairs)
     return EmpiricalMDP(
         visits=visits.reshape(n_states, n_actions),
-        transition=sp.csr_array((counts.data / np.repeat(n, np.diff(counts.indptr)), counts.indices, counts.indptr), shape),
+        transition=sp.csr_array(
+            (counts.data / np.repeat(n, np.diff(counts.indptr)), counts.indices, counts.indptr), shape
+        ),
         reward=reward.reshape(n_states, n_actions),
         reward_variance=(squares / np.maximum(visits - 1, 1)).reshape(n_states, n_actions),
         reward_given_next=rewards.data / counts.data,

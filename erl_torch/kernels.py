@@ -315,6 +315,41 @@ def log_gauge_epoch(
     return log_rho, True
 
 
+@numba.njit(cache=True, error_model="numpy")
+def online_phase(
+    pair, s_next, r, beta, value, mean_value, reward, visits, fresh, log_z, log_prior, log_weight, n_actions, steps,
+    log_rho, lr_rho, log_rho_max, begin, end,
+):  # fmt: skip
+    """Tuples begin..end of one phase of the online mode; V = ``value`` [S] is fixed, all tables [n_pairs] change in place.
+
+    ``mean_value`` and ``reward`` are means over all ``visits``; ``fresh`` counts those of this phase. Returns log rho.
+    """
+    n_states = value.size
+    y = np.zeros(n_states)
+    last = steps.size - 1
+    for s in range(n_states):
+        y[s] = _log_row(log_z, log_weight, s * n_actions, n_actions)
+    for i in range(begin, end):
+        k = pair[i]
+        s = k // n_actions
+        first = s * n_actions
+        if visits[k] == 0:
+            # Unvisited pairs of a visited state take no part.
+            if np.sum(visits[first : first + n_actions]) == 0:
+                log_weight[first : first + n_actions] = -np.inf
+            log_weight[k] = log_prior[k]
+        step = steps[min(fresh[k], last)]
+        fresh[k] += 1
+        visits[k] += 1
+        reward[k] += (r[i] - reward[k]) / visits[k]
+        mean_value[k] += (value[s_next[i]] - mean_value[k]) / visits[k]
+        w = beta * (reward[k] + mean_value[k] - value[s]) + y[s_next[i]]
+        log_z[k] = _log_blend(log_z[k], w - log_rho, step)
+        log_rho = min(_log_blend(log_rho, w - log_z[k], lr_rho), log_rho_max)
+        y[s] = _log_row(log_z, log_weight, first, n_actions)
+    return log_rho
+
+
 # ---------------------------------------------------------------------------------------------------
 # Sampling a finite MDP, and exact finite-horizon returns
 # ---------------------------------------------------------------------------------------------------

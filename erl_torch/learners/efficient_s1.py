@@ -39,6 +39,12 @@ Options, each alone (published: all off, ``unvisited="initial"``; then this *is*
                             probability 0, states outside keep the prior. "initial": u = 1 of line 7.
 The self-loop and the clip of rho are those of ``AlgorithmS1``'s defaults (``self_loop="new"``, ``clip_rho``).
 
+Online (``online``): one pass over a stream without end, no tuple kept: S*A numbers, and the counts n(s,a,s') that occur.
+The stream is cut into phases that end at 10 S A tuples times powers of ``phase_growth``; V is fixed in a phase, while
+<V> and r are means over all visits and z, rho run as above on fresh tuples; at its end V += log(y)/beta, and the counts
+give <V> anew. The loss falls as that of certainty equivalence, as 1/tuples. Delta is left out there (it cancels):
+theta = -log(rho)/beta, and delta is not estimated.
+
 Why nothing overflows: each update is a convex combination, of logarithms where they are large; w/z <= rho/a_n since
 z contains a_n w/rho, so rho rises by at most 1/a_n a tuple; z is rescaled, which changes nothing, as the updates are
 homogeneous in it.
@@ -50,11 +56,12 @@ Q-learning (Abounadi, Bertsekas, Borkar 2001), 6 Polyak and Juditsky (1992).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import scipy.sparse as sp
 import torch
 from scipy.special import logsumexp
 
@@ -177,6 +184,7 @@ class EfficientS1:
         prior_policy: [S, A], every entry > 0; None is uniform.
         tol: width at which the certificate ends the run, relative to the range of the rewards.
         clock_horizon, clock_floor: of the clocks; h >= 1, floor in (0, 1].
+        phase_growth: of the online mode, > 1.
         lr_psi, psi_tol, max_psi_epochs: of lines 2-3, without ``sample_mean_psi``.
         sample_mean_psi, expected_backup, clocks, mean_reward, warm_start, polyak, log_domain, certificate, unvisited:
             the options.
@@ -194,6 +202,7 @@ class EfficientS1:
     tol: float = 1e-7
     clock_horizon: float = 10.0
     clock_floor: float = 0.05
+    phase_growth: float = 2.0
     lr_psi: float = 0.1
     psi_tol: float = 1e-4
     max_psi_epochs: int = 10_000
@@ -218,6 +227,8 @@ class EfficientS1:
         if not (checks.is_number(self.clock_horizon) and 1 <= self.clock_horizon < math.inf):
             raise InputError("clock_horizon", self.clock_horizon, "a finite number >= 1")
         checks.step_size("clock_floor", self.clock_floor)
+        if not (checks.is_number(self.phase_growth) and 1 < self.phase_growth < math.inf):
+            raise InputError("phase_growth", self.phase_growth, "a finite number > 1")
         checks.step_size("lr_psi", self.lr_psi)
         checks.positive("psi_tol", self.psi_tol)
         checks.at_least("max_psi_epochs", self.max_psi_epochs, 1)
@@ -293,6 +304,88 @@ class EfficientS1:
             beta=self.beta,
             history={name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else {})},
         )
+
+    def online(self, chunks: Iterable[Transitions], n_states: int, n_actions: int) -> Iterator[EfficientState]:
+        """Learn from a stream that comes in chunks of any size, each seen once; yield the state after each.
+
+        Of the options only beta, prior, clock_horizon, phase_growth and the step sizes count (the clocks' floor is the
+        smaller of lr_u and clock_floor: no later pass takes its noise away); the rest are as if on.
+        States do not depend on how the stream is cut. Memory: O(S A + distinct (s,a,s')), beside the chunk.
+
+        Raises:
+            InputError: a state or action out of range.
+        """
+        start = self.init(n_states, n_actions)
+        prior = start.prior_policy.numpy()
+        n_pairs = n_states * n_actions
+        value, log_rho = np.zeros(n_states), start.log_rho
+        counts = sp.csr_array((n_pairs, n_states))
+        visits, fresh = np.zeros(n_pairs, np.int64), np.zeros(n_pairs, np.int64)
+        mean_value, reward, log_z = (np.zeros(n_pairs) for _ in range(3))
+        log_prior, log_weight = np.log(prior.ravel()), np.log(prior.ravel())
+        lr_rho, log_rho_max = self.lr_u / n_states if self.lr_rho is None else self.lr_rho, 0.0
+        steps = replace(self, clocks=True, clock_floor=min(self.clock_floor, self.lr_u)).steps()
+        n_tuples, phase, phase_end = 0, 0, 10 * n_pairs
+
+        def log_y() -> np.ndarray:
+            return np.asarray(logsumexp((log_weight + log_z).reshape(n_states, n_actions), axis=1))
+
+        for epoch, chunk in enumerate(chunks, 1):
+            chunk.check_range(n_states, n_actions)
+            pair = chunk.s * np.int32(n_actions) + chunk.a
+            done = 0
+            while done < len(chunk):
+                stop = min(len(chunk), done + BLOCK, done + phase_end - n_tuples)
+                log_rho_max = max(log_rho_max, self.beta * float(chunk.r[done:stop].max()))
+                log_rho = kernels.online_phase(
+                    pair,
+                    chunk.s_next,
+                    chunk.r,
+                    self.beta,
+                    value,
+                    mean_value,
+                    reward,
+                    visits,
+                    fresh,
+                    log_z,
+                    log_prior,
+                    log_weight,
+                    n_actions,
+                    steps,
+                    log_rho,
+                    lr_rho / (phase + 1),
+                    log_rho_max,
+                    done,
+                    stop,
+                )
+                seen = (np.ones(stop - done), (pair[done:stop], chunk.s_next[done:stop]))
+                counts = counts + sp.coo_array(seen, shape=counts.shape).tocsr()
+                n_tuples, done = n_tuples + stop - done, stop
+                if n_tuples == phase_end:
+                    h = log_y()
+                    h -= np.average(h, weights=visits.reshape(n_states, n_actions).sum(1))
+                    log_z -= np.repeat(h, n_actions)
+                    value = value + h / self.beta
+                    mean_value = counts @ value / np.maximum(visits, 1)
+                    fresh[:] = 0
+                    phase, phase_end = phase + 1, math.ceil(self.phase_growth * phase_end)
+            log_psi = torch.from_numpy(-self.beta * value)
+            mean_log_psi = torch.from_numpy(-self.beta * mean_value.reshape(n_states, n_actions))
+            table = torch.from_numpy(log_z.reshape(n_states, n_actions).copy())
+            yield replace(
+                start,
+                bias_iteration=phase,
+                epoch=epoch,
+                n_tuples=n_tuples,
+                log_rho=log_rho,
+                weight=torch.from_numpy(np.exp(log_weight).reshape(n_states, n_actions)),
+                log_z=table,
+                log_average=table,
+                log_psi=log_psi - torch.from_numpy(log_y()),
+                log_psi_in_use=log_psi,
+                log_mean_psi=mean_log_psi,
+                mean_log_psi=mean_log_psi,
+            )
 
     # -- its parts, for callers that keep the state themselves --------------------------------------
 
