@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from erl_torch.solution import Solution, Status
     from erl_torch.solvers import certify, iterate_biasing, perron, solve_biasing, solve_soft_bellman
     from erl_torch.transitions import Transitions
+    from erl_torch.uncertainty import Estimate, bootstrap_theta, policy_uncertainty, theta_uncertainty
 
 __version__ = "0.1.0"
 
@@ -31,14 +32,17 @@ _HOME = {
     "CertaintyEquivalence": "learners.certainty_equivalence",
     "EfficientS1": "learners.efficient_s1",
     "EmpiricalMDP": "empirical",
+    "Estimate": "uncertainty",
     "Evaluation": "evaluation",
     "InputError": "checks",
     "NonFiniteError": "learners.algorithm_s1",
     "S1State": "learners.algorithm_s1",
     "Solution": "solution",
+    "bootstrap_theta": "uncertainty",
     "certify": "solvers",
     "iterate_biasing": "solvers",
     "perron": "solvers",
+    "policy_uncertainty": "uncertainty",
     "solve_biasing": "solvers",
     "solve_soft_bellman": "solvers",
     "Status": "solution",
@@ -47,6 +51,7 @@ _HOME = {
     "collect": "experience",
     "empirical_mdp": "empirical",
     "evaluate": "evaluation",
+    "theta_uncertainty": "uncertainty",
 }
 
 __all__ = [
@@ -54,6 +59,7 @@ __all__ = [
     "CertaintyEquivalence",
     "EfficientS1",
     "EmpiricalMDP",
+    "Estimate",
     "Evaluation",
     "InputError",
     "NonFiniteError",
@@ -62,14 +68,17 @@ __all__ = [
     "Status",
     "TabularMDP",
     "Transitions",
+    "bootstrap_theta",
     "certify",
     "collect",
     "empirical_mdp",
     "evaluate",
     "iterate_biasing",
     "perron",
+    "policy_uncertainty",
     "solve_biasing",
     "solve_soft_bellman",
+    "theta_uncertainty",
 ]
 
 

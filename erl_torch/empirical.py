@@ -81,13 +81,13 @@ class EmpiricalMDP:
         """(pairs that take part [S, A], entries of ``transition`` that do [nnz], message, several closed classes)."""
         p, n_actions = self.transition, self.n_actions
         pair_of = np.repeat(np.arange(self.visits.size), np.diff(p.indptr))
-        alive = self.visits.any(1)
+        alive: np.ndarray = np.asarray(self.visits.any(1))
         while True:
             entries = alive[p.indices] & alive[pair_of // n_actions]
             used = (np.bincount(pair_of, entries, self.visits.size) > 0).reshape(self.visits.shape)
             if (used.any(1) == alive).all():
                 break
-            alive = used.any(1)
+            alive = np.asarray(used.any(1))
         if not alive.any():
             raise InputError("transitions", "a stream that never returns to any state", "long enough to have cycles")
         lost = self.visits.any(1) & ~alive

@@ -320,7 +320,7 @@ def online_phase(
     pair, s_next, r, beta, value, mean_value, reward, visits, fresh, log_z, log_prior, log_weight, n_actions, steps,
     log_rho, lr_rho, log_rho_max, begin, end,
 ):  # fmt: skip
-    """Tuples begin..end of one phase of the online mode; V = ``value`` [S] is fixed, all tables [n_pairs] change in place.
+    """Tuples begin..end of one phase of the online mode; V = ``value`` [S] is fixed, tables [n_pairs] change in place.
 
     ``mean_value`` and ``reward`` are means over all ``visits``; ``fresh`` counts those of this phase. Returns log rho.
     """

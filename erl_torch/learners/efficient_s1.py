@@ -39,11 +39,11 @@ Options, each alone (published: all off, ``unvisited="initial"``; then this *is*
                             probability 0, states outside keep the prior. "initial": u = 1 of line 7.
 The self-loop and the clip of rho are those of ``AlgorithmS1``'s defaults (``self_loop="new"``, ``clip_rho``).
 
-Online (``online``): one pass over a stream without end, no tuple kept: S*A numbers, and the counts n(s,a,s') that occur.
-The stream is cut into phases that end at 10 S A tuples times powers of ``phase_growth``; V is fixed in a phase, while
-<V> and r are means over all visits and z, rho run as above on fresh tuples; at its end V += log(y)/beta, and the counts
-give <V> anew. The loss falls as that of certainty equivalence, as 1/tuples. Delta is left out there (it cancels):
-theta = -log(rho)/beta, and delta is not estimated.
+Online (``online``): one pass over a stream without end, no tuple kept: S*A numbers, and the counts n(s,a,s') that
+occur. The stream is cut into phases that end at 10 S A tuples times powers of ``phase_growth``; V is fixed in a phase,
+while <V> and r are means over all visits and z, rho run as above on fresh tuples; at its end V += log(y)/beta, and the
+counts give <V> anew. The loss falls as that of certainty equivalence, as 1/tuples. Delta is left out there (it
+cancels): theta = -log(rho)/beta, and delta is not estimated.
 
 Why nothing overflows: each update is a convex combination, of logarithms where they are large; w/z <= rho/a_n since
 z contains a_n w/rho, so rho rises by at most 1/a_n a tuple; z is rescaled, which changes nothing, as the updates are
@@ -422,7 +422,7 @@ class EfficientS1:
         prior = check_policy("prior_policy", self.prior_policy, n_states, n_actions)
         weight = prior
         if self.unvisited == "exclude":
-            inside = part.used.any(1)
+            inside = np.asarray(part.used.any(1))
             takes_part = part.used[data.s, data.a] & inside[data.s_next]
             if not takes_part.all():
                 data = Transitions(*(getattr(data, name)[takes_part] for name in ("s", "a", "r", "s_next", "a_next")))
@@ -537,8 +537,8 @@ class EfficientS1:
         """The step of a pair's n-th visit in a biasing iteration, n = 0, 1, ...; the last entry stays."""
         if not self.clocks:
             return np.array([self.lr_u])
-        n_falling = math.ceil(self.clock_horizon * (1 / self.clock_floor - 1))
-        return np.maximum(self.clock_floor, self.clock_horizon / (self.clock_horizon + np.arange(n_falling + 1)))
+        n = np.arange(math.ceil(self.clock_horizon * (1 / self.clock_floor - 1)) + 1)
+        return np.asarray(np.maximum(self.clock_floor, self.clock_horizon / (self.clock_horizon + n)))
 
     def _u_epoch(self, state: EfficientState, stream: EfficientStream) -> tuple[np.ndarray, np.ndarray, float]:
         """(log z, log total, log rho) after an epoch of lines 9-11."""
