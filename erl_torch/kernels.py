@@ -322,7 +322,8 @@ def online_phase(
 ):  # fmt: skip
     """Tuples begin..end of one phase of the online mode; V = ``value`` [S] is fixed, tables [n_pairs] change in place.
 
-    ``mean_value`` and ``reward`` are means over all ``visits``; ``fresh`` counts those of this phase. Returns log rho.
+    ``mean_value`` and ``reward`` are means over all ``visits``; ``fresh`` counts those of this phase.
+    Returns (log rho, log_rho_max: at least beta times the largest r so far).
     """
     n_states = value.size
     y = np.zeros(n_states)
@@ -338,6 +339,8 @@ def online_phase(
             if np.sum(visits[first : first + n_actions]) == 0:
                 log_weight[first : first + n_actions] = -np.inf
             log_weight[k] = log_prior[k]
+            y[s] = _log_row(log_z, log_weight, first, n_actions)
+        log_rho_max = max(log_rho_max, beta * r[i])
         step = steps[min(fresh[k], last)]
         fresh[k] += 1
         visits[k] += 1
@@ -347,7 +350,7 @@ def online_phase(
         log_z[k] = _log_blend(log_z[k], w - log_rho, step)
         log_rho = min(_log_blend(log_rho, w - log_z[k], lr_rho), log_rho_max)
         y[s] = _log_row(log_z, log_weight, first, n_actions)
-    return log_rho
+    return log_rho, log_rho_max
 
 
 # ---------------------------------------------------------------------------------------------------

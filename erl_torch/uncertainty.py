@@ -70,9 +70,11 @@ class Estimate:
     def __str__(self) -> str:
         low, high = self.interval()
         half = (high - low) / 2
-        digits = 0 if half <= 0 else max(0, int(np.ceil(-np.log10(half))))
-        digits += bool(half > 0 and digits and half * 10**digits < 2)  # two digits where the first is a 1
-        return f"{self.name} = {self.value:.{digits or 4}f} +- {half:.{digits or 4}f}"
+        digits = 4
+        if half > 0:
+            first = int(np.floor(np.log10(half)))  # of its digits; two are shown where the first is a 1
+            digits = max(0, (half < 2 * 10.0**first) - first)
+        return f"{self.name} = {self.value:.{digits}f} +- {half:.{digits}f}"
 
 
 def theta_uncertainty(model: EmpiricalMDP, beta: float, prior_policy: Any = None) -> Estimate:

@@ -43,7 +43,7 @@ def test_interval_covers(beta, noise):
 def test_policy_value_covers_and_matches_its_spread():
     policy = np.random.default_rng(0).dirichlet(np.full(4, 3.0), size=15)
     truth = objective(CLIFF, policy, UNIFORM, 3.0)
-    estimates = [policy_uncertainty(empirical_mdp(collect(CLIFF, 50, 1000, s), 15, 4), policy, 3.0) for s in range(60)]
+    estimates = [policy_uncertainty(empirical_mdp(collect(CLIFF, 300, 1000, s), 15, 4), policy, 3.0) for s in range(60)]
     values, errors = np.array([(e.value, e.standard_error) for e in estimates]).T
     assert values.mean() == pytest.approx(truth, abs=4 * values.std() / np.sqrt(60))
     assert errors.mean() == pytest.approx(values.std(), rel=0.3)

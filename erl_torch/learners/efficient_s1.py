@@ -75,6 +75,7 @@ from erl_torch.solution import Solution, Status
 from erl_torch.solvers.problem import soft_backup
 from erl_torch.transitions import Transitions
 
+LAST_STEP = 100_000  # visits of a pair in one biasing iteration after which its step stays
 SAFE_RANGE = 180.0  # of logarithms, for plain numbers: products of four such stay in range
 
 
@@ -336,8 +337,7 @@ class EfficientS1:
             done = 0
             while done < len(chunk):
                 stop = min(len(chunk), done + BLOCK, done + phase_end - n_tuples)
-                log_rho_max = max(log_rho_max, self.beta * float(chunk.r[done:stop].max()))
-                log_rho = kernels.online_phase(
+                log_rho, log_rho_max = kernels.online_phase(
                     pair,
                     chunk.s_next,
                     chunk.r,
@@ -537,7 +537,7 @@ class EfficientS1:
         """The step of a pair's n-th visit in a biasing iteration, n = 0, 1, ...; the last entry stays."""
         if not self.clocks:
             return np.array([self.lr_u])
-        n = np.arange(math.ceil(self.clock_horizon * (1 / self.clock_floor - 1)) + 1)
+        n = np.arange(min(math.ceil(self.clock_horizon * (1 / self.clock_floor - 1)), LAST_STEP) + 1)
         return np.asarray(np.maximum(self.clock_floor, self.clock_horizon / (self.clock_horizon + n)))
 
     def _u_epoch(self, state: EfficientState, stream: EfficientStream) -> tuple[np.ndarray, np.ndarray, float]:

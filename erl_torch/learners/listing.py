@@ -114,8 +114,8 @@ def online_phase(
     steps: Any,
     lr_rho: float,
     rho_max: float,
-) -> float:
-    """One phase of the online mode. ``sums`` [3, S, A]: visits, sum of V(s'), sum of r, all of the past. Returns rho."""
+) -> tuple[float, float]:
+    """One phase of the online mode. ``sums`` [3, S, A]: visits, sum of V(s'), sum of r so far. Returns rho, rho_max."""
     fresh = np.zeros(z.shape, int)
     for s, a, r, s_next in zip(data.s.tolist(), data.a.tolist(), data.r.tolist(), data.s_next.tolist(), strict=True):
         sums[:, s, a] += (1, value[s_next], r)
@@ -125,5 +125,6 @@ def online_phase(
         step = steps[min(fresh[s, a], len(steps) - 1)]
         fresh[s, a] += 1
         z[s, a] = (1 - step) * z[s, a] + step * w / rho
+        rho_max = max(rho_max, math.exp(beta * r))
         rho = min((1 - lr_rho) * rho + lr_rho * w / z[s, a], rho_max)
-    return float(rho)
+    return float(rho), rho_max
