@@ -13,31 +13,41 @@ import erl_torch.envs  # noqa: F401  (registers the environments)
 
 if TYPE_CHECKING:
     from erl_torch.checks import InputError
+    from erl_torch.empirical import EmpiricalMDP, empirical_mdp
     from erl_torch.envs.estimate import EstimatedModel, estimate_mdp
     from erl_torch.envs.rollout import collect_rollouts, rollout
     from erl_torch.evaluation import Evaluation, evaluate
     from erl_torch.experience import collect
     from erl_torch.learners.algorithm_s1 import AlgorithmS1, NonFiniteError, S1State
+    from erl_torch.learners.certainty_equivalence import CertaintyEquivalence
+    from erl_torch.learners.efficient_s1 import EfficientS1
     from erl_torch.mdp import TabularMDP
     from erl_torch.models import MeanRewardWarning, tabular_mdp
     from erl_torch.solution import Solution, Status
     from erl_torch.solvers import certify, iterate_biasing, perron, solve_biasing, solve_soft_bellman
     from erl_torch.transitions import Transitions
+    from erl_torch.uncertainty import Estimate, bootstrap_theta, policy_uncertainty, theta_uncertainty
 
 __version__ = "0.1.0"
 
 _HOME = {
     "AlgorithmS1": "learners.algorithm_s1",
     "EstimatedModel": "envs.estimate",
+    "CertaintyEquivalence": "learners.certainty_equivalence",
+    "EfficientS1": "learners.efficient_s1",
+    "EmpiricalMDP": "empirical",
+    "Estimate": "uncertainty",
     "Evaluation": "evaluation",
     "InputError": "checks",
     "MeanRewardWarning": "models",
     "NonFiniteError": "learners.algorithm_s1",
     "S1State": "learners.algorithm_s1",
     "Solution": "solution",
+    "bootstrap_theta": "uncertainty",
     "certify": "solvers",
     "iterate_biasing": "solvers",
     "perron": "solvers",
+    "policy_uncertainty": "uncertainty",
     "solve_biasing": "solvers",
     "solve_soft_bellman": "solvers",
     "Status": "solution",
@@ -49,10 +59,16 @@ _HOME = {
     "evaluate": "evaluation",
     "tabular_mdp": "models",
     "rollout": "envs.rollout",
+    "empirical_mdp": "empirical",
+    "theta_uncertainty": "uncertainty",
 }
 
 __all__ = [
     "AlgorithmS1",
+    "CertaintyEquivalence",
+    "EfficientS1",
+    "EmpiricalMDP",
+    "Estimate",
     "EstimatedModel",
     "Evaluation",
     "InputError",
@@ -63,17 +79,21 @@ __all__ = [
     "Status",
     "TabularMDP",
     "Transitions",
+    "bootstrap_theta",
     "certify",
     "collect",
     "collect_rollouts",
+    "empirical_mdp",
     "estimate_mdp",
     "evaluate",
     "iterate_biasing",
     "perron",
+    "policy_uncertainty",
     "rollout",
     "solve_biasing",
     "solve_soft_bellman",
     "tabular_mdp",
+    "theta_uncertainty",
 ]
 
 

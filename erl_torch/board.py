@@ -26,6 +26,14 @@ S1_LAYOUT = {
     },
     "Reward bias": {"delta": ["Multiline", ["s1/delta_max", "s1/delta_mean"]]},
 } | RETURNS
+LEARNER_LAYOUT = {
+    "theta": {
+        "theta": ["Multiline", ["learner/theta"]],
+        "bound on the loss in the empirical model": ["Multiline", ["learner/empirical_width"]],
+    },
+    "Reward bias": {"delta": ["Multiline", ["learner/delta_max", "learner/delta_mean"]]},
+    "Action values": {"q": ["Multiline", ["learner/q_min", "learner/q_max"]]},
+} | RETURNS
 EXACT_LAYOUT = {
     "theta": {
         "theta with its bounds": ["Margin", ["exact/theta", "exact/theta_lower", "exact/theta_upper"]],

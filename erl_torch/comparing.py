@@ -20,10 +20,10 @@ from erl_torch import checks, kernels, pictures
 from erl_torch.checks import InputError
 from erl_torch.comparison import compare
 from erl_torch.config import check_comparison_keys
-from erl_torch.experience import known_mdp
 from erl_torch.files import read_npy, write_json, write_png
 from erl_torch.learners import LEARNERS
-from erl_torch.training import make_env, make_learner
+from erl_torch.mdp import TabularMDP
+from erl_torch.training import make_env, make_learner, make_world
 
 
 def run_comparison(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lambda: None) -> dict[str, Any]:
@@ -49,7 +49,9 @@ def run_comparison(cfg: DictConfig, directory: Path, safe_point: Callable[[], No
     if not kernels.compiled_before():
         print("compiling the loops, about ten seconds: on the first run only", file=sys.stderr)
     with contextlib.closing(make_env(cfg.env)) as env:
-        mdp = known_mdp(env)
+        world = make_world(cfg.env, env, safe_point)
+    # The start of the stream may be another than that of the episodes; the optimum does not depend on it.
+    mdp = world.source if isinstance(world.source, TabularMDP) else world.mdp
     if mdp is None:
         raise InputError("env", cfg.env.name, "one with a known model: gaps are measured against its exact solution")
     learners = {}

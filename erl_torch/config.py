@@ -141,6 +141,46 @@ class S1:
 
 
 @dataclass
+class S1Efficient:
+    """The arguments of ``erl_torch.EfficientS1``; prior_policy is a file here."""
+
+    name: str = "s1_efficient"
+    beta: float = 10.0
+    lr_u: float = 0.005
+    lr_rho: float | None = None
+    n_epochs: int = 3
+    n_bias: int = 30
+    prior_policy: str | None = None
+    tol: float = 1e-7
+    clock_horizon: float = 10.0
+    clock_floor: float = 0.05
+    phase_growth: float = 2.0
+    lr_psi: float = 0.1
+    psi_tol: float = 1e-4
+    max_psi_epochs: int = 10_000
+    sample_mean_psi: bool = True
+    expected_backup: bool = True
+    clocks: bool = True
+    mean_reward: bool = True
+    warm_start: bool = True
+    polyak: bool = True
+    log_domain: str = "auto"
+    certificate: bool = True
+    unvisited: str = "exclude"
+
+
+@dataclass
+class CertaintyEquivalence:
+    """The arguments of ``erl_torch.CertaintyEquivalence``."""
+
+    name: str = "certainty_equivalence"
+    beta: float = 10.0
+    tol: float = 1e-10
+    max_steps: int = 200
+    prior_policy: str | None = None
+
+
+@dataclass
 class Exact:
     """The arguments of ``erl_torch.learners.Exact``."""
 
@@ -269,6 +309,8 @@ SCHEMAS: dict[str, dict[str, type]] = {
     },
     "learner": {
         "s1": S1,
+        "s1_efficient": S1Efficient,
+        "certainty_equivalence": CertaintyEquivalence,
         "differential_soft_q": DifferentialSoftQ,
         "rvi_soft_q": RVISoftQ,
         "u_learning": ULearning,

@@ -24,9 +24,10 @@ from tqdm import tqdm
 
 import erl_torch
 from erl_torch import checks, kernels, pictures
-from erl_torch.board import EXACT_LAYOUT, S1_LAYOUT, Board
+from erl_torch.board import EXACT_LAYOUT, LEARNER_LAYOUT, S1_LAYOUT, Board
 from erl_torch.checks import InputError
 from erl_torch.config import check_keys
+from erl_torch.empirical import empirical_mdp
 from erl_torch.envs.discretise import Discretise
 from erl_torch.envs.estimate import estimate_mdp
 from erl_torch.envs.grid_world import GridWorld
@@ -40,8 +41,10 @@ from erl_torch.rng import Streams, streams
 from erl_torch.solution import Solution, Status
 from erl_torch.solvers import certify
 from erl_torch.transitions import Transitions
+from erl_torch.uncertainty import Estimate, theta_uncertainty
 
 SafePoint = Callable[[], None]
+SMALL = 2000  # states of an empirical model that is solved beside every run
 NOT_ARGUMENTS = ("name", "id", "suggest", "stream", "n_samples", "model_seed")
 
 
@@ -67,7 +70,7 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
     _check_evaluation(cfg.evaluation)
     env = make_env(cfg.env)
     with contextlib.closing(env):
-        world = _world(cfg.env, env, safe_point)
+        world = make_world(cfg.env, env, safe_point)
         judge = world.mdp
         if judge is not None and judge.transition.nnz > cfg.evaluation.exact_up_to:
             judge = None
@@ -106,6 +109,7 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
                             board.scalars(run.tags(state, last), step)
                         if milestone and drawer:
                             drawer.policy(state, step, f"policy, {milestone}")
+                        if milestone and drawer and hasattr(state, "reward_bias"):
                             drawer.bias(state, step, f"reward bias, {milestone}")
                         bar.set_postfix_str(run.postfix(state), refresh=False)
                         bar.update(step - bar.n)
@@ -117,12 +121,18 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
             solution = run.solution(state, history, stopped)
             if judge is not None and solution.theta_bounds is None and cfg.evaluation.certify:
                 solution = certify(solution, judge, learner.beta, prior)
+            estimate = run.uncertainty(prior) if cfg.evaluation.certify else None
+            if estimate is not None:
+                interval = dict(zip(("lower", "upper"), estimate.interval(), strict=True))
+                values = {"theta": estimate.value, **{f"theta_{k}": v for k, v in interval.items()}}
+                board.scalars({f"data/{k}": v for k, v in values.items()}, run.step(state))
             rate = run.step(state) / max(clock.seconds, 1e-9)
             board.scalars({f"time/{run.unit}_per_second": rate}, run.step(state))
 
     solution.save(directory / "solution.npz")
     seconds = time.perf_counter() - began
     result = _result(cfg, solution, last, run.n_experience, clock.seconds, seconds)
+    result["data"] = None if estimate is None else str(estimate)
     write_json(directory / "result.json", result)
     print(_summary(cfg, first, last, start, result, directory, run.unit))
     if stopped is not None:
@@ -130,7 +140,7 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
     return result
 
 
-class _World(NamedTuple):
+class World(NamedTuple):
     """What a run learns from and is judged by."""
 
     source: TabularMDP | gym.Env[Any, Any]  # of the stream
@@ -142,46 +152,59 @@ class _Learning:
     """A run that learns from a stream of tuples."""
 
     unit = "tuples"
-    layout = S1_LAYOUT
 
     def __init__(
         self,
         cfg: DictConfig,
-        world: _World,
-        learner: AlgorithmS1,
+        world: World,
+        learner: Any,
         rng: Streams,
         prior: np.ndarray,
         safe_point: SafePoint,
     ) -> None:
-        self.learner = learner
+        self.learner, self.name = learner, cfg.learner.name
+        self.layout = S1_LAYOUT if isinstance(learner, AlgorithmS1) else LEARNER_LAYOUT
         self.sizes = sizes(world.source)
         self.data = _experience(cfg.experience, world.source, *self.sizes, rng, prior, safe_point)
         self.n_experience = len(self.data)
         safe_point()
 
-    def states(self) -> Iterator[S1State]:
-        return self.learner.iterate(self.data, *self.sizes)
+    def states(self) -> Iterator[Any]:
+        yield from self.learner.iterate(self.data, *self.sizes)
 
-    def step(self, state: S1State) -> int:
-        return state.n_tuples
+    def step(self, state: Any) -> int:
+        return int(state.n_tuples)
 
-    def milestone(self, state: S1State) -> str:
-        return f"biasing iteration {state.bias_iteration}" if state.epoch == self.learner.n_epochs else ""
+    def milestone(self, state: Any) -> str:
+        if state.epoch < getattr(self.learner, "n_epochs", 1):
+            return ""
+        return f"biasing iteration {state.bias_iteration}" if hasattr(state, "bias_iteration") else "last pass"
 
-    def tags(self, state: S1State, measured: Evaluation) -> dict[str, float]:
-        logged = ("rho", "theta", "delta_max", "delta_mean", "psi_error", "psi_epochs", "bias_iteration")
-        metrics = state.metrics()
-        return {f"s1/{name}": metrics[name] for name in logged} | _evaluation_tags(measured)
+    def tags(self, state: Any, measured: Evaluation) -> dict[str, float]:
+        prefix = "s1" if isinstance(state, S1State) else "learner"
+        known = {k: v for k, v in state.metrics().items() if k not in ("epoch", "n_tuples") and np.isfinite(v)}
+        return {f"{prefix}/{name}": value for name, value in known.items()} | _evaluation_tags(measured)
 
-    def postfix(self, state: S1State) -> str:
-        place = f"bias {state.bias_iteration}/{self.learner.n_bias - 1} epoch {state.epoch}"
-        return f"{place} rho {state.rho:.3e} theta {state.theta:.4f}"
+    def postfix(self, state: Any) -> str:
+        bias = f"bias {state.bias_iteration}/{self.learner.n_bias - 1} " if hasattr(state, "bias_iteration") else ""
+        return f"{bias}epoch {state.epoch}" + ("" if state.theta is None else f" theta {state.theta:.4f}")
 
     def bar(self) -> tqdm:
-        return _bar(self.learner.n_bias * self.learner.n_epochs * self.n_experience, self.unit)
+        passes = getattr(self.learner, "n_bias", 1) * getattr(self.learner, "n_epochs", 1)
+        return _bar(passes * self.n_experience, self.unit)
 
-    def solution(self, state: S1State, history: list[dict[str, float]], stopped: BaseException | None) -> Solution:
-        return self.learner.solution(state, history, stopped if isinstance(stopped, NonFiniteError) else None)
+    def solution(self, state: Any, history: list[dict[str, float]], stopped: BaseException | None) -> Solution:
+        failure = stopped if isinstance(stopped, NonFiniteError) else None
+        solution: Solution = self.learner.solution(state, history, failure)
+        return solution
+
+    def uncertainty(self, prior: np.ndarray) -> Estimate | None:
+        """theta* with its error, as the counts of the stream alone have it; None where that is no small problem."""
+        if self.sizes[0] > SMALL:
+            return None
+        with contextlib.suppress(InputError):
+            return theta_uncertainty(empirical_mdp(self.data, *self.sizes), self.learner.beta, prior)
+        return None
 
 
 class _Solving:
@@ -194,7 +217,7 @@ class _Solving:
     def __init__(
         self,
         cfg: DictConfig,
-        world: _World,
+        world: World,
         learner: Exact,
         rng: Streams,
         prior: np.ndarray,
@@ -231,6 +254,9 @@ class _Solving:
     def solution(self, state: ExactState, history: list[dict[str, float]], stopped: BaseException | None) -> Solution:
         return self.learner.solution(self.mdp, state, history, stopped is not None)
 
+    def uncertainty(self, prior: np.ndarray) -> None:
+        return None
+
 
 def _bar(total: int | None, unit: str) -> tqdm:
     return tqdm(
@@ -247,14 +273,16 @@ def _evaluation_tags(measured: Evaluation) -> dict[str, float]:
     }
 
 
-def _say(milestone: str, state: S1State | ExactState, measured: Evaluation) -> None:
-    if isinstance(state, S1State):
-        found = f"rho {state.rho:.4e}  theta {state.theta:.5f}"
+def _say(milestone: str, state: Any, measured: Evaluation) -> None:
+    if isinstance(state, ExactState):
+        found = f"theta {state.theta:.10f} in [{state.theta_bounds[0]:.10f}, {state.theta_bounds[1]:.10f}]  "
     else:
-        found = f"theta {state.theta:.10f} in [{state.theta_bounds[0]:.10f}, {state.theta_bounds[1]:.10f}]"
+        found = f"rho {state.rho:.4e}  " if hasattr(state, "rho") else ""
+        found += "" if state.theta is None else f"theta {state.theta:.5f}  "
+    if hasattr(state, "reward_bias"):
+        found += f"delta max {float(state.reward_bias.max()):.4f}  "
     tqdm.write(
-        f"{milestone}: {found}  delta max {state.reward_bias_max:.4f}  "
-        f"reward per step {measured.reward_per_step:.4f}  objective {measured.objective:.4f}",
+        f"{milestone}: {found}reward per step {measured.reward_per_step:.4f}  objective {measured.objective:.4f}",
         file=sys.stderr,
     )
 
@@ -308,7 +336,8 @@ def make_env(cfg: DictConfig) -> gym.Env[Any, Any]:
         return env
 
 
-def _world(cfg: DictConfig, env: gym.Env[Any, Any], safe_point: SafePoint) -> _World:
+def make_world(cfg: DictConfig, env: gym.Env[Any, Any], safe_point: SafePoint) -> World:
+    """What there is to learn from in ``env``, as ``cfg`` says. Raises InputError."""
     if "n_samples" in cfg:
         return _control_world(cfg, env, safe_point)
     on_end = cfg.get("on_end", "restart")
@@ -316,7 +345,7 @@ def _world(cfg: DictConfig, env: gym.Env[Any, Any], safe_point: SafePoint) -> _W
     if known_mdp(env) is not None or not cfg.get("use_model") or not hasattr(env.unwrapped, "P"):
         if on_end == "absorb":
             raise InputError("env.on_end", on_end, "restart, where there is no model (P) to read")
-        return _World(env, known_mdp(env))
+        return World(env, known_mdp(env))
     models = {}
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", MeanRewardWarning)
@@ -334,14 +363,14 @@ def _world(cfg: DictConfig, env: gym.Env[Any, Any], safe_point: SafePoint) -> _W
     if episode is not None and episode.reward[absorbing(episode)].any():
         episode = None  # an end that pays for ever is no end
     mdp = models.get(on_end)
-    return _World(env if mdp is None else mdp, mdp, episode)
+    return World(env if mdp is None else mdp, mdp, episode)
 
 
-def _control_world(cfg: DictConfig, env: gym.Env[Any, Any], safe_point: SafePoint) -> _World:
+def _control_world(cfg: DictConfig, env: gym.Env[Any, Any], safe_point: SafePoint) -> World:
     with _group("env"):
         checks.one_of("stream", cfg.stream, ("model", "episodes"))
         if cfg.stream == "episodes":
-            return _World(env, None)
+            return World(env, None)
         base: Any = env.unwrapped
         mdp = estimate_mdp(
             base.task,
@@ -355,7 +384,7 @@ def _control_world(cfg: DictConfig, env: gym.Env[Any, Any], safe_point: SafePoin
             progress=True,
         ).mdp
     # Episodes of the stream start in any cell, so that all are learnt about.
-    return _World(TabularMDP(mdp.transition, mdp.reward), mdp)
+    return World(TabularMDP(mdp.transition, mdp.reward), mdp)
 
 
 def _mean_return(episode: TabularMDP, horizon: int, policy: np.ndarray) -> float:
@@ -422,10 +451,10 @@ class _Drawer:
     def __init__(self, board: Board, grid: GridWorld | None) -> None:
         self.board, self.grid = board, grid
 
-    def policy(self, state: S1State | ExactState, step: int, title: str) -> None:
+    def policy(self, state: Any, step: int, title: str) -> None:
         self.board.picture("policy", pictures.policy_picture(state.policy.cpu().numpy(), self.grid, title), step)
 
-    def bias(self, state: S1State | ExactState, step: int, title: str) -> None:
+    def bias(self, state: Any, step: int, title: str) -> None:
         self.board.picture(
             "reward_bias", pictures.bias_picture(state.reward_bias.cpu().numpy(), self.grid, title), step
         )
@@ -477,9 +506,11 @@ def _summary(
         directory = directory.resolve().relative_to(Path.cwd())
     logs = "runs" if directory.parts[0] == "runs" else directory
     done = result[f"n_{unit}"]
+    is_s1 = isinstance(start, S1State)
     rows = [
-        ("theta", f"{start.theta:12.5f}" if isinstance(start, S1State) else " " * 12, f"{result['theta']:12.5f}"),
-        *([("rho", f"{start.rho:12.4e}", f"{result['rho']:12.4e}")] if isinstance(start, S1State) else []),
+        *([("theta", f"{start.theta:12.5f}", f"{result['theta']:12.5f}")] if is_s1 else []),
+        *([("theta", f"{'':12}", f"{result['theta']:12.5f}")] if not is_s1 and result["theta"] is not None else []),
+        *([("rho", f"{start.rho:12.4e}", f"{result['rho']:12.4e}")] if is_s1 else []),
         ("reward per step", f"{first.reward_per_step:12.5f}", f"{last.reward_per_step:12.5f}"),
         ("objective", f"{first.objective:12.5f}", f"{last.objective:12.5f}"),
         ("episode return", f"{first.mean_return:12.2f}", f"{last.mean_return:12.2f}"),
@@ -494,6 +525,8 @@ def _summary(
         low, high = result["theta_bounds"]
         gap = "" if result["gap"] is None else f"; objective at most {result['gap']:.2g} below its maximum"
         lines.append(f"{'proven':18}theta* in [{low:.10g}, {high:.10g}]{gap}")
+    if result["data"]:
+        lines.append(f"{'the data say':18}{result['data']} (95%)")
     if result["n_experience"]:
         rate = done / max(result["seconds_learning"], 1e-3) / 1e6
         lines.append(f"{'tuples streamed':18}{done:,} (of {result['n_experience']:,}; {rate:.3g} M/s)")

@@ -220,12 +220,12 @@ def test_every_learner_can_be_compared():
         (["learners=[]"], "learners=[]: must be at least one"),
         (["seeds=0"], "seeds=0: must be a whole number >= 1"),
         (["beta=-1"], "learner.s1.beta=-1.0: must be a finite number > 0"),
-        (["learner.s1.beta=5"], "differential_soft_q: beta=10.0: must be that of s1, 5"),
+        (["learner.s1.beta=5"], "s1_efficient: beta=10.0: must be that of s1, 5"),
         (["learner.s1.lr_u=7"], "learner.s1.lr_u=7.0: must be"),
         (["+learner.s1.lr=7"], "learner.s1.lr"),
         (["+learner.s3.lr=7"], "learner.s3"),
         (["+sedes=3"], "sedes"),
-        (["env=gym", "env.id=FrozenLake-v1"], "env=FrozenLake-v1: must be one with a known model"),
+        (["env=frozen_lake", "env.use_model=false"], "env=frozen_lake: must be one with a known model"),
         (["experience.save_to=x.npz"], "experience.save_to=x.npz: must be null"),
     ],
 )
@@ -266,7 +266,7 @@ def test_command_line(tmp_path):
     assert failed.stderr.startswith("error: learners=s4: must be")
     assert failed.stderr.count("\n") == 1
     about = run("--help")
-    assert "env={gym,windy_cliff}" in about.stdout
+    assert "windy_cliff,windy_frozen_lake" in about.stdout
     assert "learner={" not in about.stdout
 
 

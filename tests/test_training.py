@@ -17,6 +17,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from test_config import composed
 
 from erl_torch import InputError, Solution, Status, Transitions, cli, evaluate
+from erl_torch.learners import LEARNERS
 from erl_torch.training import train
 
 ROOT = Path(__file__).parents[1]
@@ -69,7 +70,12 @@ def test_scalars(finished):
         f"s1/{name}"
         for name in ("rho", "theta", "delta_max", "delta_mean", "psi_error", "psi_epochs", "bias_iteration")
     } | {"eval/return", "eval/reward_per_step", "eval/objective"}
-    assert set(reader.Tags()["scalars"]) == documented | {"time/tuples_per_second"}
+    assert set(reader.Tags()["scalars"]) == documented | {
+        "time/tuples_per_second",
+        "data/theta",
+        "data/theta_lower",
+        "data/theta_upper",
+    }
     values = {}
     for tag in documented:
         assert [e.step for e in reader.Scalars(tag)] == steps, tag
@@ -90,6 +96,28 @@ def test_every_tag_is_documented(finished):
     tags = events(finished[0]).Tags()
     for tag in [*tags["scalars"], *tags["images"]]:
         assert f"`{tag}`" in text, tag
+
+
+def test_interval_of_the_data(finished):
+    directory, result = finished
+    reader = events(directory)
+    theta, low, high = (reader.Scalars(f"data/theta{end}")[-1].value for end in ("", "_lower", "_upper"))
+    assert low < 1.0101363366 < high  # fixed seed
+    value, half = map(float, result["data"].removeprefix("theta = ").split(" +- "))
+    assert value == pytest.approx(theta, abs=0.005)
+    assert half == pytest.approx((high - low) / 2, rel=0.1)
+
+
+@pytest.mark.parametrize("learner", sorted(set(LEARNERS) - {"s1", "exact"}))
+def test_every_learner_runs(tmp_path, learner):
+    passes = [] if learner == "certainty_equivalence" else ["learner.n_epochs=2"]
+    result = train(composed(f"learner={learner}", "experience.n_episodes=20", *passes), tmp_path)
+    reader = events(tmp_path)
+    page = (ROOT / "docs" / "logging.md").read_text()
+    assert all(f"`{tag}`" in page or f"`s1/{tag.split('/')[1]}`" in page for tag in reader.Tags()["scalars"])
+    assert [e.value for e in reader.Scalars("eval/objective")][-1] == pytest.approx(result["objective"], abs=1e-6)
+    assert result["gap"] >= 0
+    assert "policy" in reader.Tags()["images"]
 
 
 def test_pictures_text_and_boards(finished):

@@ -15,6 +15,8 @@ from erl_torch.learners.action_value import (
     ULearning,
 )
 from erl_torch.learners.algorithm_s1 import AlgorithmS1, NonFiniteError, S1State
+from erl_torch.learners.certainty_equivalence import CertaintyEquivalence
+from erl_torch.learners.efficient_s1 import EfficientS1, EfficientState
 from erl_torch.learners.exact import Exact, ExactState
 from erl_torch.learners.z_learning import ZLearning
 
@@ -27,6 +29,8 @@ LEARNERS: dict[str, Any] = {
     "soft_q": SoftQ,
     "q_learning": QLearning,
     "sarsa": Sarsa,
+    "s1_efficient": EfficientS1,
+    "certainty_equivalence": CertaintyEquivalence,
     "exact": Exact,
 }
 
@@ -34,7 +38,10 @@ __all__ = [
     "LEARNERS",
     "ActionValueState",
     "AlgorithmS1",
+    "CertaintyEquivalence",
     "DifferentialSoftQ",
+    "EfficientS1",
+    "EfficientState",
     "Exact",
     "ExactState",
     "NonFiniteError",

@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
 
 from erl_torch.chains import RegenerativeLU, SingularChainError
 from erl_torch.evaluation import kl_per_state
-from erl_torch.mdp import TabularMDP, check_policy
+from erl_torch.mdp import check_policy
 from erl_torch.solution import Solution, Status
 from erl_torch.solvers.problem import Problem, soft_backup, theta_bounds
 
 
+class Sized(Protocol):
+    """An MDP as far as its answer is concerned."""
+
+    @property
+    def n_states(self) -> int: ...
+
+    @property
+    def n_actions(self) -> int: ...
+
+
 def exact_solution(
-    mdp: TabularMDP,
+    mdp: Sized,
     problem: Problem,
     value: np.ndarray,
     status: Status,
@@ -83,7 +93,7 @@ def policy_gap(problem: Problem, policy: np.ndarray, bounds: tuple[float, float]
     return float(max(-bounds[0] - gain, 0.0) + slack)
 
 
-def reducible_solution(mdp: TabularMDP, problem: Problem, prior_policy: Any) -> Solution:
+def reducible_solution(mdp: Sized, problem: Problem, prior_policy: Any) -> Solution:
     """The best policy and bounds that V = 0 proves, and a message that names the classes."""
     value = np.zeros(problem.n_states)
     backed_up, _ = soft_backup(problem.action_value(value), problem.prior, problem.beta)

@@ -26,7 +26,7 @@ from erl_torch.chains import RegenerativeLU, SingularChainError
 from erl_torch.mdp import TabularMDP
 from erl_torch.solution import Solution
 from erl_torch.solvers.problem import Problem, soft_backup, theta_bounds
-from erl_torch.solvers.result import exact_solution, how_it_ended, policy_gap, reducible_solution
+from erl_torch.solvers.result import Sized, exact_solution, how_it_ended, policy_gap, reducible_solution
 
 FIRST_HORIZON = 300.0  # steps
 GROWTH = 100.0
@@ -71,7 +71,13 @@ def solve_soft_bellman(
     Raises:
         InputError: beta, prior or tol out of range.
     """
-    problem = Problem.of(mdp, beta, prior_policy)
+    return solve_problem(Problem.of(mdp, beta, prior_policy), mdp, prior_policy, tol, max_steps)
+
+
+def solve_problem(
+    problem: Problem, mdp: Sized, prior_policy: Any = None, tol: float = 1e-10, max_steps: int = 200
+) -> Solution:
+    """As ``solve_soft_bellman``, for a problem on part of the states of ``mdp``, of which only the sizes count."""
     checks.positive("tol", tol)
     checks.at_least("max_steps", max_steps, 1)
     ref = problem.regeneration_state()

@@ -1,0 +1,153 @@
+"""The empirical model of a stream: visit counts, transition frequencies, mean rewards.
+
+What no tuple shows is no part of the problem. ``EmpiricalMDP.problem`` poses it over what remains:
+
+    pairs     a pair (s,a) never visited is not available: the optimum is over the visited pairs. The KL cost is still
+              that of the whole prior, so with m(s) the prior's mass on the visited actions of s
+              sum_visited pi0 exp(beta q) = m sum_visited (pi0/m) exp(beta q): a reward log(m(s))/beta on top.
+    states    a state never left (the last of an episode, say) has no known future: the tuples that lead there are
+              left out, and with them the pairs and states that have no other tuples.
+    classes   where the empirical process has several closed classes, the one with the most tuples is the problem;
+              where it has one, states from which it is reached are in too.
+
+States outside keep the prior policy. ``message`` says what was left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from erl_torch import checks, kernels
+from erl_torch.chains import classes
+from erl_torch.checks import InputError
+from erl_torch.mdp import check_policy
+from erl_torch.solvers.problem import Problem
+from erl_torch.transitions import Transitions
+
+
+@dataclass(frozen=True, eq=False)
+class EmpiricalMDP:
+    """Sufficient statistics of a stream: S*A and nnz numbers, whatever its length."""
+
+    visits: np.ndarray  # n(s,a), [S, A] int64
+    transition: sp.csr_array  # n(s,a,s')/n(s,a), [S*A, S]; rows without visits are empty
+    reward: np.ndarray  # mean, [S, A]; 0 without visits
+    reward_variance: np.ndarray  # of one reward, [S, A], divisor n-1; 0 below two visits
+    reward_given_next: np.ndarray  # mean reward of (s,a,s'), [nnz], entries as in `transition`
+
+    @property
+    def n_states(self) -> int:
+        return int(self.visits.shape[0])
+
+    @property
+    def n_actions(self) -> int:
+        return int(self.visits.shape[1])
+
+    def problem(self, beta: float, prior_policy: Any = None) -> EmpiricalProblem:
+        """The empirical problem; see the module's docstring for what is left out.
+
+        Raises:
+            InputError: beta or prior out of range, or no state that is ever returned to.
+        """
+        checks.positive("beta", beta)
+        prior = check_policy("prior_policy", prior_policy, self.n_states, self.n_actions)
+        if not (prior > 0).all():
+            s, a = np.argwhere(prior <= 0)[0]
+            raise InputError(f"prior_policy[{s}, {a}]", prior[s, a], "> 0 (leave the action out instead)")
+        used, entries, message, reducible = self._part()
+        inside = used.any(1)
+        states = np.flatnonzero(inside)
+        # A pair that is not used repeats one that is, with a prior of 0: shapes stay [n, A], the graph is unchanged.
+        action = np.where(used, np.arange(self.n_actions), used.argmax(1)[:, None])[states]
+        rows = (states[:, None] * self.n_actions + action).ravel()
+        p = self.transition.copy()
+        p.data = p.data * entries
+        p = sp.csr_array(p[rows][:, states])
+        p.eliminate_zeros()
+        p = sp.csr_array(sp.diags_array(1 / p.sum(axis=1)) @ p)
+        p.sort_indices()
+        weight = (prior * used)[states]
+        mass = weight.sum(1, keepdims=True)
+        reward = np.take_along_axis(self.reward[states], action, axis=1) + np.log(np.minimum(mass, 1.0)) / beta
+        start = self.visits[states].sum(1) / self.visits[states].sum()
+        problem = Problem(states, p, reward, weight / mass, start, float(beta))
+        return EmpiricalProblem(problem, used, message, reducible)
+
+    def _part(self) -> tuple[np.ndarray, np.ndarray, str, bool]:
+        """(pairs that take part [S, A], entries of ``transition`` that do [nnz], message, several closed classes)."""
+        p, n_actions = self.transition, self.n_actions
+        pair_of = np.repeat(np.arange(self.visits.size), np.diff(p.indptr))
+        alive: np.ndarray = np.asarray(self.visits.any(1))
+        while True:
+            entries = alive[p.indices] & alive[pair_of // n_actions]
+            used = (np.bincount(pair_of, entries, self.visits.size) > 0).reshape(self.visits.shape)
+            if (used.any(1) == alive).all():
+                break
+            alive = np.asarray(used.any(1))
+        if not alive.any():
+            raise InputError("transitions", "a stream that never returns to any state", "long enough to have cycles")
+        lost = self.visits.any(1) & ~alive
+        message = f"states {np.flatnonzero(lost)[:5].tolist()} lead nowhere in this stream" if lost.any() else ""
+        origin, to = pair_of[entries] // n_actions, p.indices[entries]
+        graph = sp.csr_array((np.ones(len(to)), (origin, to)), shape=(self.n_states, self.n_states))
+        label, closed = classes(graph)
+        closed[label[~alive]] = False  # states that take no part are classes of their own
+        if closed.sum() > 1:
+            tuples = np.bincount(label, self.visits.sum(1)) * closed
+            inside = label == np.argmax(tuples)
+            used &= inside[:, None]
+            entries &= inside[pair_of // n_actions]
+            message = (
+                f"{closed.sum()} closed sets of states in this stream; solved on {_name(inside)}, the most visited"
+            )
+        return used, entries, message, bool(closed.sum() > 1)
+
+
+def _name(inside: np.ndarray) -> str:
+    states = np.flatnonzero(inside)
+    return f"{states[:5].tolist()}{'...' if len(states) > 5 else ''}"
+
+
+@dataclass(frozen=True, eq=False)
+class EmpiricalProblem:
+    """The soft Bellman problem that a stream poses."""
+
+    problem: Problem  # on the states that take part
+    used: np.ndarray  # [S, A] bool, pairs that take part
+    message: str  # what was left out, and why; "" if nothing was
+    reducible: bool  # the stream shows several closed classes; this is the most visited
+
+
+def empirical_mdp(transitions: Transitions, n_states: int, n_actions: int) -> EmpiricalMDP:
+    """Counts and mean rewards of a stream. Raises InputError naming the first tuple out of range."""
+    transitions.check_range(n_states, n_actions)
+    n_pairs = n_states * n_actions
+    if n_pairs > np.iinfo(np.int32).max:
+        raise InputError("n_states * n_actions", n_pairs, "below 2**31")
+    pair = transitions.s * np.int32(n_actions) + transitions.a
+    visits = kernels.visit_counts(pair, n_pairs)
+    shape = (n_pairs, n_states)
+    # Both share one pattern: sums of equal (row, column) are kept even where they are 0.
+    counts = sp.coo_array((np.ones(len(pair)), (pair, transitions.s_next)), shape=shape).tocsr()
+    rewards = sp.coo_array((transitions.r, (pair, transitions.s_next)), shape=shape).tocsr()
+    for table in (counts, rewards):
+        table.sum_duplicates()
+    n = np.maximum(visits, 1)
+    # Around the first reward of each pair, so that a constant reward has exactly itself as mean.
+    base = np.zeros(n_pairs)
+    base[pair] = transitions.r
+    reward = base + np.bincount(pair, transitions.r - base[pair], n_pairs) / n
+    squares = np.bincount(pair, (transitions.r - reward[pair]) ** 2, n_pairs)
+    return EmpiricalMDP(
+        visits=visits.reshape(n_states, n_actions),
+        transition=sp.csr_array(
+            (counts.data / np.repeat(n, np.diff(counts.indptr)), counts.indices, counts.indptr), shape
+        ),
+        reward=reward.reshape(n_states, n_actions),
+        reward_variance=(squares / np.maximum(visits - 1, 1)).reshape(n_states, n_actions),
+        reward_given_next=rewards.data / counts.data,
+    )

@@ -1,0 +1,166 @@
+"""Certainty equivalence: count, then solve the empirical model exactly. The yardstick of every tabular learner.
+
+Objective: the average reward minus KL(pi || prior)/beta, that of Algorithm S1; not optimistic. The optimum is over the
+visited pairs of the class of states that the stream shows (``erl_torch.empirical``); states outside keep the prior.
+The policy's loss in the true MDP, g* - J, falls as 1/tuples: it is what the data allow.
+
+The action a' of the stream is not used, and the stream may come from any behaviour policy.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from erl_torch import checks
+from erl_torch.empirical import EmpiricalMDP, EmpiricalProblem, empirical_mdp
+from erl_torch.mdp import check_policy
+from erl_torch.solution import Solution, Status
+from erl_torch.solvers.soft_bellman import solve_problem
+from erl_torch.transitions import Transitions
+
+
+@dataclass(frozen=True, eq=False)
+class CertaintyEquivalenceState:
+    """Before (epoch 0) and after (epoch 1) the solution of the empirical model."""
+
+    epoch: int
+    n_tuples: int  # counted
+    beta: float
+    prior_policy: torch.Tensor  # [S, A]
+    policy: torch.Tensor  # [S, A]; 0 on pairs never visited, the prior in states outside the empirical problem
+    u: torch.Tensor  # [S, A], largest 1; 0 on pairs never visited
+    rho: float
+    theta: float  # middle of the bounds on the empirical theta*
+    reward_bias: torch.Tensor  # [S, A]
+    empirical_width: float  # of those bounds, reward a step
+    answer: Solution | None = None
+
+    @property
+    def reward_bias_max(self) -> float:
+        return float(self.reward_bias.max())
+
+    def metrics(self) -> dict[str, float]:
+        """The scalars that are logged, by their documented names (docs/logging.md)."""
+        return {
+            "rho": self.rho,
+            "theta": self.theta,
+            "delta_max": self.reward_bias_max,
+            "delta_mean": float(self.reward_bias.mean()),
+            "empirical_width": self.empirical_width,
+            "epoch": self.epoch,
+            "n_tuples": self.n_tuples,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class CertaintyEquivalenceStream:
+    """A stream as its sufficient statistics."""
+
+    model: EmpiricalMDP
+    empirical: EmpiricalProblem
+    n_tuples: int
+
+
+@dataclass(frozen=True, eq=False)
+class CertaintyEquivalence:
+    """Counts -> empirical model -> soft policy iteration.
+
+    Args:
+        beta: inverse temperature, 1/reward, > 0.
+        tol: width of the bounds on the empirical theta* to stop at, relative to the range of the rewards.
+        max_steps: Newton steps at most.
+        prior_policy: [S, A], entries > 0; None is uniform.
+
+    Raises:
+        InputError: an argument out of its range.
+    """
+
+    beta: float = 10.0
+    tol: float = 1e-10
+    max_steps: int = 200
+    prior_policy: torch.Tensor | np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        checks.positive("beta", self.beta)
+        checks.positive("tol", self.tol)
+        checks.at_least("max_steps", self.max_steps, 1)
+
+    def fit(self, transitions: Transitions, n_states: int, n_actions: int) -> Solution:
+        """Count and solve. Status REDUCIBLE, with a message, where the stream shows several closed sets of states."""
+        (state,) = self.iterate(transitions, n_states, n_actions)
+        return self.solution(state, [state.metrics()])
+
+    def iterate(self, transitions: Transitions, n_states: int, n_actions: int) -> Iterator[CertaintyEquivalenceState]:
+        """Yield the one state."""
+        yield self.step(self.init(n_states, n_actions), self.prepare(transitions, n_states, n_actions))
+
+    def init(self, n_states: int, n_actions: int) -> CertaintyEquivalenceState:
+        """The prior policy, before any tuple."""
+        prior = torch.from_numpy(check_policy("prior_policy", self.prior_policy, n_states, n_actions))
+        zero, one = torch.zeros_like(prior), torch.ones_like(prior)
+        return CertaintyEquivalenceState(0, 0, self.beta, prior, prior, one, 1.0, 0.0, zero, math.inf)
+
+    def prepare(self, transitions: Transitions, n_states: int, n_actions: int) -> CertaintyEquivalenceStream:
+        """Count. Raises InputError for tuples out of range, or a stream that never returns to any state."""
+        model = empirical_mdp(transitions, n_states, n_actions)
+        return CertaintyEquivalenceStream(model, model.problem(self.beta, self.prior_policy), len(transitions))
+
+    def step(self, state: CertaintyEquivalenceState, stream: CertaintyEquivalenceStream) -> CertaintyEquivalenceState:
+        """Solve. Pure: ``state`` is left as it is."""
+        part = stream.empirical
+        answer = solve_problem(part.problem, stream.model, self.prior_policy, self.tol, self.max_steps)
+        assert answer.theta_bounds is not None
+        theta, rho = answer.theta, answer.rho
+        assert theta is not None
+        assert rho is not None
+        lower, upper = answer.theta_bounds
+        known = torch.from_numpy(part.used | ~part.used.any(1, keepdims=True))
+        answer = replace(
+            answer,
+            u=answer.u * known,
+            theta_bounds=None,  # what is proven of the empirical model is not proven of the true one
+            gap=None,
+            n_steps=stream.n_tuples,
+            status=Status.REDUCIBLE if part.reducible else answer.status,
+            message=part.message or answer.message,
+        )
+        return replace(
+            state,
+            epoch=1,
+            n_tuples=stream.n_tuples,
+            policy=answer.policy,
+            u=answer.u,
+            rho=rho,
+            theta=theta,
+            reward_bias=answer.reward_bias,
+            empirical_width=upper - lower,
+            answer=answer,
+        )
+
+    def solution(
+        self,
+        state: CertaintyEquivalenceState,
+        history: list[dict[str, float]] | None = None,
+        failure: ArithmeticError | None = None,
+    ) -> Solution:
+        """The solution that ``state`` stands for; ``history`` holds one ``metrics()``."""
+        rows = history or []
+        answer = state.answer or Solution(
+            policy=state.policy,
+            u=state.u,
+            psi=1 / state.u.mean(1),
+            rho=state.rho,
+            theta=state.theta,
+            reward_bias=state.reward_bias,
+            reward_bias_max=0.0,
+            n_steps=0,
+            status=Status.NON_FINITE if failure else Status.STOPPED,
+            message=str(failure or ""),
+            beta=self.beta,
+        )
+        return replace(answer, history={name: np.array([row[name] for row in rows]) for name in (rows or [{}])[0]})

@@ -1,0 +1,636 @@
+r"""Algorithm S1 taken to the limit of its data: every table at the accuracy that the stream allows.
+
+Symbols, shapes and equation numbers as in ``erl_torch.learners.algorithm_s1``. With psi = exp(-beta V) and the gauge
+z = psi u, one biasing iteration streams
+
+    w = g(s,a) y(s'),    z(s,a) += a_n (w/rho - z(s,a)),    rho += lr_rho (w/z(s,a) - rho)            lines 9-11
+    log g(s,a) = beta (r(s,a) + <V>(s,a) - V(s) - Delta),    y(s) = sum_a pi0(a|s) z(s,a)
+
+and ends with V += log(y)/beta (line 12). Where the iterations end, y = 1 in every state, so w = g(s,a) whatever s':
+the noise of the backup is gone, and a step that need not fall finds z = g/rho exactly. That is
+
+    V(s) - theta = (1/beta) log sum_a pi0(a|s) exp(beta (r(s,a) + <V>(s,a)))
+
+on the empirical model: the fixed point is certainty equivalence, and its loss g* - J is what the data allow.
+The published steps stay about a hundred times further away: their <psi> remembers the last ten visits, and their
+backup is noisy also at the end.
+
+Options, each alone (published: all off, ``unvisited="initial"``; then this *is* Algorithm S1, tested)
+    1. ``sample_mean_psi``  <psi> and <log psi> are means over all visits (step 1/n), from counts: no passes, and with
+                            them lr_psi, psi_tol and max_psi_epochs go. Off: lines 2-3.
+    2. ``expected_backup``  y(s') above in place of u(s',a') psi(s'). a' is not used, so any behaviour policy with
+                            support will do; off, a' must be a draw from the prior at s'.
+    3. ``clocks``           a_n = max(clock_floor, h/(h + n)), n earlier visits of (s,a) in this biasing iteration,
+                            h = ``clock_horizon``: what n visits leave of the start is (n/h)^-h, and a pair that is
+                            seen once a pass is at its value after a few. lr_rho falls as lr_rho/(epoch of the
+                            iteration). The floor lets z fall by any number of decades, and far states mix; the noise
+                            it would leave vanishes with that of the backup. Off: a_n = lr_u, lr_rho.
+    4. ``mean_reward``      r(s,a) is the mean over all visits. Off: each tuple's own r, that is an average of
+                            exp(beta r), optimistic about noise in r.
+    5. ``warm_start``       u and theta are carried over to the next biasing iteration (rho = exp(-beta (theta +
+                            Delta)) with its Delta). Off: u = 1, rho = exp(-beta), lines 7-8.
+    6. ``polyak``           line 12 and the policy take the mean of z over the visits of the second half of an
+                            iteration's epochs. Off: the last z.
+    7. ``log_domain``       "on": z and rho as logarithms, for any beta; "off": as numbers; "auto": as numbers where
+                            the tables span less than 10^80, and again in logarithms should a number leave the range.
+    8. ``certificate``      stop once max(TV - V) - min(T_pi V - V) <= tol * (range of r) on the empirical model, where
+                            V and pi are the state's own: its policy's loss there is not above that. Off: all passes.
+    9. ``unvisited``        "exclude": the problem is that of ``erl_torch.empirical``: pairs never visited have
+                            probability 0, states outside keep the prior. "initial": u = 1 of line 7.
+The self-loop and the clip of rho are those of ``AlgorithmS1``'s defaults (``self_loop="new"``, ``clip_rho``).
+
+Online (``online``): one pass over a stream without end, no tuple kept: S*A numbers, and the counts n(s,a,s') that
+occur. The stream is cut into phases that end at 10 S A tuples times powers of ``phase_growth``; V is fixed in a phase,
+while <V> and r are means over all visits and z, rho run as above on fresh tuples; at its end V += log(y)/beta, and the
+counts give <V> anew. The loss falls as that of certainty equivalence, as 1/tuples. Delta is left out there (it
+cancels): theta = -log(rho)/beta, and delta is not estimated.
+
+Why nothing overflows: each update is a convex combination, of logarithms where they are large; w/z <= rho/a_n since
+z contains a_n w/rho, so rho rises by at most 1/a_n a tuple; z is rescaled, which changes nothing, as the updates are
+homogeneous in it.
+
+Sources: 1, 5, 8, gauge and fixed point derived; 2 as expected SARSA; 3 as the asynchronous clocks of average-reward
+Q-learning (Abounadi, Bertsekas, Borkar 2001), 6 Polyak and Juditsky (1992).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+import torch
+from scipy.special import logsumexp
+
+from erl_torch import checks, kernels
+from erl_torch.checks import InputError
+from erl_torch.empirical import EmpiricalMDP, EmpiricalProblem, empirical_mdp
+from erl_torch.evaluation import kl_per_state
+from erl_torch.learners.algorithm_s1 import BLOCK, LOG_PSI_EPSILON, NonFiniteError
+from erl_torch.mdp import check_policy
+from erl_torch.solution import Solution, Status
+from erl_torch.solvers.problem import soft_backup
+from erl_torch.transitions import Transitions
+
+LAST_STEP = 100_000  # visits of a pair in one biasing iteration after which its step stays
+SAFE_RANGE = 180.0  # of logarithms, for plain numbers: products of four such stay in range
+
+
+@dataclass(frozen=True, eq=False)
+class EfficientState:
+    """Everything known after an epoch; a value, never changed in place. Tables are logarithms."""
+
+    bias_iteration: int  # 0 is the unbiased iteration
+    epoch: int  # epochs done in this biasing iteration
+    n_tuples: int  # tuples streamed through lines 9-11 since the start
+    beta: float
+    log_rho: float
+    prior_policy: torch.Tensor  # [S, A]
+    weight: torch.Tensor  # prior where the pair takes part, else 0, [S, A]
+    log_z: torch.Tensor  # [S, A], gauge of log_psi_in_use
+    log_total: torch.Tensor  # sum of z over the visits of the averaging window, [S, A]
+    log_average: torch.Tensor  # the z that policy and psi are made of, [S, A]
+    log_psi: torch.Tensor  # [S], line 12
+    log_psi_in_use: torch.Tensor  # [S], behind the present biases
+    log_mean_psi: torch.Tensor  # log <psi>, [S, A]
+    mean_log_psi: torch.Tensor  # [S, A]
+    empirical_width: float = math.inf  # bound on the policy's loss in the empirical model, reward a step
+    psi_converged: bool = True
+    certified: bool = False
+
+    @property
+    def rho(self) -> float:
+        """0 or infinite beyond double precision: ``theta`` is made of its logarithm."""
+        with np.errstate(over="ignore", under="ignore"):
+            return float(np.exp(self.log_rho))
+
+    @property
+    def reward_bias(self) -> torch.Tensor:
+        """delta of line 5, [S, A], reward; 0 where the stream has no visit."""
+        return ((self.log_mean_psi - self.mean_log_psi) / self.beta).clamp(min=0.0)
+
+    @property
+    def reward_bias_max(self) -> float:
+        """Delta, line 6; reward."""
+        return float(self.reward_bias.max())
+
+    @property
+    def theta(self) -> float:
+        """-log(rho)/beta - Delta, reward a step."""
+        return -self.log_rho / self.beta - self.reward_bias_max
+
+    @property
+    def u(self) -> torch.Tensor:
+        """[S, A], mean 1; 0 on pairs that take no part, or below double precision."""
+        log_u = self.log_average - self.log_psi_in_use[:, None]
+        u = (log_u - log_u.max()).exp() * (self.weight > 0)
+        return u / u.mean()
+
+    @property
+    def psi(self) -> torch.Tensor:
+        """[S], 1 / sum_a pi0 u; within double precision."""
+        return self.log_psi.clamp(-700.0, 700.0).exp()
+
+    @property
+    def policy(self) -> torch.Tensor:
+        """[S, A], lines 13-14."""
+        return (self.weight.log() + self.log_average).softmax(1)
+
+    def metrics(self) -> dict[str, float]:
+        """The scalars that are logged, by their documented names (docs/logging.md)."""
+        return {
+            "rho": self.rho,
+            "theta": self.theta,
+            "delta_max": self.reward_bias_max,
+            "delta_mean": float(self.reward_bias.mean()),
+            "empirical_width": self.empirical_width,
+            "bias_iteration": self.bias_iteration,
+            "epoch": self.epoch,
+            "n_tuples": self.n_tuples,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class EfficientStream:
+    """A stream made ready for the compiled loops: done once a fit."""
+
+    n_tuples: int  # of the whole stream, those that take no part included
+    pair: np.ndarray  # [N] int32, s * A + a
+    after: np.ndarray  # [N] int32: s', or s' * A + a'
+    log_factor: np.ndarray  # [N] beta r where `noisy`, else [0]
+    noisy: bool
+    model: EmpiricalMDP
+    part: EmpiricalProblem
+    weight: torch.Tensor  # [S, A]
+    inside: np.ndarray  # [S, A] bool: pairs of the problem; u = 1 elsewhere
+    visited: np.ndarray  # [n_visited], pairs in the stream
+    psi_rows: tuple[np.ndarray, np.ndarray, np.ndarray]  # CSR, rows of the visited pairs that sum to 1
+    log_keep: np.ndarray  # [n_visited], log of what an epoch of lines 2-3 leaves of the old value; -inf: nothing
+    log_rho_max: float
+
+
+@dataclass(frozen=True, eq=False)
+class EfficientS1:
+    """Algorithm S1 with options that reach certainty equivalence; see the module's docstring.
+
+    Args:
+        beta: inverse temperature, 1/reward, > 0.
+        lr_u, lr_rho: step sizes in (0, 1]; lr_rho None is lr_u / n_states. With ``clocks``, lr_u counts for nothing
+            else.
+        n_epochs: passes over the stream a biasing iteration. Short ones serve best where u is carried over.
+        n_bias: biasing iterations at most, the unbiased first included.
+        prior_policy: [S, A], every entry > 0; None is uniform.
+        tol: width at which the certificate ends the run, relative to the range of the rewards.
+        clock_horizon, clock_floor: of the clocks; h >= 1, floor in (0, 1].
+        phase_growth: of the online mode, > 1.
+        lr_psi, psi_tol, max_psi_epochs: of lines 2-3, without ``sample_mean_psi``.
+        sample_mean_psi, expected_backup, clocks, mean_reward, warm_start, polyak, log_domain, certificate, unvisited:
+            the options.
+
+    Raises:
+        InputError: an argument out of its range.
+    """
+
+    beta: float = 10.0
+    lr_u: float = 0.005
+    lr_rho: float | None = None
+    n_epochs: int = 3
+    n_bias: int = 30
+    prior_policy: torch.Tensor | np.ndarray | None = None
+    tol: float = 1e-7
+    clock_horizon: float = 10.0
+    clock_floor: float = 0.05
+    phase_growth: float = 2.0
+    lr_psi: float = 0.1
+    psi_tol: float = 1e-4
+    max_psi_epochs: int = 10_000
+    sample_mean_psi: bool = True
+    expected_backup: bool = True
+    clocks: bool = True
+    mean_reward: bool = True
+    warm_start: bool = True
+    polyak: bool = True
+    log_domain: str = "auto"
+    certificate: bool = True
+    unvisited: str = "exclude"
+
+    def __post_init__(self) -> None:
+        checks.positive("beta", self.beta)
+        checks.step_size("lr_u", self.lr_u)
+        if self.lr_rho is not None:
+            checks.step_size("lr_rho", self.lr_rho)
+        checks.at_least("n_epochs", self.n_epochs, 1)
+        checks.at_least("n_bias", self.n_bias, 1)
+        checks.positive("tol", self.tol)
+        if not (checks.is_number(self.clock_horizon) and 1 <= self.clock_horizon < math.inf):
+            raise InputError("clock_horizon", self.clock_horizon, "a finite number >= 1")
+        checks.step_size("clock_floor", self.clock_floor)
+        if not (checks.is_number(self.phase_growth) and 1 < self.phase_growth < math.inf):
+            raise InputError("phase_growth", self.phase_growth, "a finite number > 1")
+        checks.step_size("lr_psi", self.lr_psi)
+        checks.positive("psi_tol", self.psi_tol)
+        checks.at_least("max_psi_epochs", self.max_psi_epochs, 1)
+        checks.one_of("log_domain", self.log_domain, ("auto", "on", "off"))
+        checks.one_of("unvisited", self.unvisited, ("exclude", "initial"))
+
+    @classmethod
+    def published(cls, **options: object) -> EfficientS1:
+        """Every option at the paper's value, unless given: Algorithm S1 itself."""
+        off: dict[str, object] = dict.fromkeys(SWITCHES, False)
+        paper: dict[str, object] = {"log_domain": "off", "unvisited": "initial", "n_epochs": 15, "n_bias": 6}
+        return cls(**(off | paper | options))  # type: ignore[arg-type]
+
+    # -- the whole run ------------------------------------------------------------------------------
+
+    def fit(self, transitions: Transitions, n_states: int, n_actions: int) -> Solution:
+        """Run to the end and return the solution.
+
+        Status CONVERGED once certified, COMPLETED after n_bias iterations; NON_FINITE only with
+        ``log_domain="off"``, with the tables of the last good epoch.
+
+        Raises:
+            InputError: a state or action out of range, a prior policy of the wrong shape, or a stream that never
+                returns to any state.
+        """
+        state = self.init(n_states, n_actions)
+        history: list[dict[str, float]] = []
+        failure: NonFiniteError | None = None
+        try:
+            for state in self.iterate(transitions, n_states, n_actions):
+                history.append(state.metrics())
+        except NonFiniteError as error:
+            failure = error
+        return self.solution(state, history, failure)
+
+    def iterate(self, transitions: Transitions, n_states: int, n_actions: int) -> Iterator[EfficientState]:
+        """Yield the state after each epoch: n_bias * n_epochs times, or until certified."""
+        stream = self.prepare(transitions, n_states, n_actions)
+        state = self.init(n_states, n_actions)
+        for _ in range(self.n_bias * self.n_epochs):
+            state = self.step(state, stream)
+            yield state
+            if state.certified:
+                return
+
+    def solution(
+        self,
+        state: EfficientState,
+        history: list[dict[str, float]] | None = None,
+        failure: ArithmeticError | None = None,
+    ) -> Solution:
+        """The solution that ``state`` stands for; ``history`` holds one ``metrics()`` an epoch."""
+        if failure is not None:
+            status = Status.NON_FINITE
+        elif state.certified:
+            status = Status.CONVERGED
+        elif (state.bias_iteration, state.epoch) != (self.n_bias - 1, self.n_epochs):
+            status = Status.STOPPED
+        else:
+            status = Status.COMPLETED if state.psi_converged else Status.PSI_LIMIT
+        rows = history or []
+        return Solution(
+            policy=state.policy,
+            u=state.u,
+            psi=state.psi,
+            rho=state.rho,
+            theta=state.theta,
+            reward_bias=state.reward_bias,
+            reward_bias_max=state.reward_bias_max,
+            n_steps=state.n_tuples,
+            status=status,
+            message=str(failure) if failure else "",
+            beta=self.beta,
+            history={name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else {})},
+        )
+
+    def online(self, chunks: Iterable[Transitions], n_states: int, n_actions: int) -> Iterator[EfficientState]:
+        """Learn from a stream that comes in chunks of any size, each seen once; yield the state after each.
+
+        Of the options only beta, prior, clock_horizon, phase_growth and the step sizes count (the clocks' floor is the
+        smaller of lr_u and clock_floor: no later pass takes its noise away); the rest are as if on.
+        States do not depend on how the stream is cut. Memory: O(S A + distinct (s,a,s')), beside the chunk.
+
+        Raises:
+            InputError: a state or action out of range.
+        """
+        start = self.init(n_states, n_actions)
+        prior = start.prior_policy.numpy()
+        n_pairs = n_states * n_actions
+        value, log_rho = np.zeros(n_states), start.log_rho
+        counts = sp.csr_array((n_pairs, n_states))
+        visits, fresh = np.zeros(n_pairs, np.int64), np.zeros(n_pairs, np.int64)
+        mean_value, reward, log_z = (np.zeros(n_pairs) for _ in range(3))
+        log_prior, log_weight = np.log(prior.ravel()), np.log(prior.ravel())
+        lr_rho, log_rho_max = self.lr_u / n_states if self.lr_rho is None else self.lr_rho, 0.0
+        steps = replace(self, clocks=True, clock_floor=min(self.clock_floor, self.lr_u)).steps()
+        n_tuples, phase, phase_end = 0, 0, 10 * n_pairs
+
+        def log_y() -> np.ndarray:
+            return np.asarray(logsumexp((log_weight + log_z).reshape(n_states, n_actions), axis=1))
+
+        for epoch, chunk in enumerate(chunks, 1):
+            chunk.check_range(n_states, n_actions)
+            pair = chunk.s * np.int32(n_actions) + chunk.a
+            done = 0
+            while done < len(chunk):
+                stop = min(len(chunk), done + BLOCK, done + phase_end - n_tuples)
+                log_rho, log_rho_max = kernels.online_phase(
+                    pair,
+                    chunk.s_next,
+                    chunk.r,
+                    self.beta,
+                    value,
+                    mean_value,
+                    reward,
+                    visits,
+                    fresh,
+                    log_z,
+                    log_prior,
+                    log_weight,
+                    n_actions,
+                    steps,
+                    log_rho,
+                    lr_rho / (phase + 1),
+                    log_rho_max,
+                    done,
+                    stop,
+                )
+                seen = (np.ones(stop - done), (pair[done:stop], chunk.s_next[done:stop]))
+                counts = counts + sp.coo_array(seen, shape=counts.shape).tocsr()
+                n_tuples, done = n_tuples + stop - done, stop
+                if n_tuples == phase_end:
+                    h = log_y()
+                    h -= np.average(h, weights=visits.reshape(n_states, n_actions).sum(1))
+                    log_z -= np.repeat(h, n_actions)
+                    value = value + h / self.beta
+                    mean_value = counts @ value / np.maximum(visits, 1)
+                    fresh[:] = 0
+                    phase, phase_end = phase + 1, math.ceil(self.phase_growth * phase_end)
+            log_psi = torch.from_numpy(-self.beta * value)
+            mean_log_psi = torch.from_numpy(-self.beta * mean_value.reshape(n_states, n_actions))
+            table = torch.from_numpy(log_z.reshape(n_states, n_actions).copy())
+            yield replace(
+                start,
+                bias_iteration=phase,
+                epoch=epoch,
+                n_tuples=n_tuples,
+                log_rho=log_rho,
+                weight=torch.from_numpy(np.exp(log_weight).reshape(n_states, n_actions)),
+                log_z=table,
+                log_average=table,
+                log_psi=log_psi - torch.from_numpy(log_y()),
+                log_psi_in_use=log_psi,
+                log_mean_psi=mean_log_psi,
+                mean_log_psi=mean_log_psi,
+            )
+
+    # -- its parts, for callers that keep the state themselves --------------------------------------
+
+    def init(self, n_states: int, n_actions: int) -> EfficientState:
+        """The state before any tuple: the prior policy, rho = exp(-beta), no bias."""
+        prior_table = check_policy("prior_policy", self.prior_policy, n_states, n_actions)
+        if not (prior_table > 0).all():
+            s, a = np.argwhere(prior_table <= 0)[0]
+            raise InputError(f"prior_policy[{s}, {a}]", prior_table[s, a], "> 0 (leave the action out instead)")
+        prior = torch.from_numpy(prior_table)
+        zero, none = torch.zeros_like(prior), torch.zeros(n_states, dtype=torch.float64)
+        return EfficientState(
+            bias_iteration=0,
+            epoch=0,
+            n_tuples=0,
+            beta=self.beta,
+            log_rho=-self.beta,
+            prior_policy=prior,
+            weight=prior,
+            log_z=zero,
+            log_total=zero - math.inf,
+            log_average=zero,
+            log_psi=none,
+            log_psi_in_use=none,
+            log_mean_psi=zero,
+            mean_log_psi=zero,
+        )
+
+    def prepare(self, transitions: Transitions, n_states: int, n_actions: int) -> EfficientStream:
+        """Validate the stream against the sizes and compute what is the same in every epoch."""
+        data = transitions
+        model = empirical_mdp(data, n_states, n_actions)
+        part = model.problem(self.beta, self.prior_policy)
+        prior = check_policy("prior_policy", self.prior_policy, n_states, n_actions)
+        weight = prior
+        if self.unvisited == "exclude":
+            inside = np.asarray(part.used.any(1))
+            takes_part = part.used[data.s, data.a] & inside[data.s_next]
+            if not takes_part.all():
+                data = Transitions(*(getattr(data, name)[takes_part] for name in ("s", "a", "r", "s_next", "a_next")))
+                model = empirical_mdp(data, n_states, n_actions)
+            weight = prior * (part.used | ~inside[:, None])
+        pair = data.s * np.int32(n_actions) + data.a
+        visits = model.visits.ravel()
+        visited = np.flatnonzero(visits)
+        indptr, indices, values = model.transition.indptr, model.transition.indices, model.transition.data
+        log_keep = np.full(len(visited), -np.inf)
+        if not self.sample_mean_psi:
+            indptr, indices, values = kernels.psi_map(pair, data.s_next, visits, n_states, self.lr_psi)
+            values = values / np.repeat(np.add.reduceat(values, indptr[visited]), np.diff(indptr)[visited])
+            with np.errstate(divide="ignore"):
+                log_keep = visits[visited] * np.log1p(-self.lr_psi)
+        noisy = not self.mean_reward and bool((model.reward.ravel()[pair] != data.r).any())
+        return EfficientStream(
+            n_tuples=len(transitions),
+            pair=pair,
+            after=data.s_next if self.expected_backup else data.s_next * np.int32(n_actions) + data.a_next,
+            log_factor=self.beta * data.r if noisy else np.zeros(1),
+            noisy=noisy,
+            model=model,
+            part=part,
+            weight=torch.from_numpy(weight),
+            inside=part.used if self.unvisited == "exclude" else np.ones_like(part.used),
+            visited=visited,
+            psi_rows=(np.append(indptr[visited], len(values)), indices, values),
+            log_keep=log_keep,
+            log_rho_max=max(0.0, self.beta * float(data.r.max())),
+        )
+
+    def step(self, state: EfficientState, stream: EfficientStream) -> EfficientState:
+        """One epoch of lines 9-12, and before the first of a biasing iteration lines 2-8.
+
+        Pure: ``state`` is left as it is. Raises NonFiniteError, with ``log_domain="off"`` only.
+        """
+        if state.epoch == self.n_epochs:
+            state = replace(state, bias_iteration=state.bias_iteration + 1, epoch=0)
+        if state.epoch == 0:
+            state = self._new_biases(replace(state, weight=stream.weight), stream)
+        log_z, log_total, log_rho = self._u_epoch(state, stream)
+        log_average = log_z
+        inside, log_psi = stream.inside, state.log_psi_in_use.numpy()[:, None]
+        window = state.epoch + 1 - self.n_epochs // 2  # epochs in the mean
+        if self.polyak and window > 0:
+            n = stream.model.visits * window
+            log_average = np.where(n > 0, log_total - np.log(np.maximum(n, 1)), log_z)
+        with np.errstate(divide="ignore"):
+            log_weight = np.log(state.weight.numpy())
+        log_u = log_average - log_psi
+        log_u -= logsumexp(log_u[inside]) - math.log(inside.sum())
+        log_u = np.where(inside, log_u, 0.0)
+        log_average = log_u + log_psi
+        after = replace(
+            state,
+            epoch=state.epoch + 1,
+            n_tuples=state.n_tuples + stream.n_tuples,
+            log_rho=log_rho,
+            log_z=torch.from_numpy(log_z),
+            log_total=torch.from_numpy(log_total),
+            log_average=torch.from_numpy(log_average),
+            log_psi=torch.from_numpy(-logsumexp(log_weight + log_u, axis=1)),  # line 12
+        )
+        width = empirical_width(stream.part, after.log_psi.numpy(), after.policy.numpy())
+        certified = self.certificate and width <= self.tol * stream.part.problem.reward_range
+        return replace(after, empirical_width=width, certified=certified)
+
+    # -- lines --------------------------------------------------------------------------------------
+
+    def _new_biases(self, state: EfficientState, stream: EfficientStream) -> EfficientState:
+        """Lines 2-8."""
+        log_mean_psi, mean_log_psi = state.log_mean_psi.numpy().copy(), state.mean_log_psi.numpy().copy()
+        x, y = log_mean_psi.reshape(-1), mean_log_psi.reshape(-1)  # views
+        log_psi = state.log_psi.numpy()
+        visited, (indptr, indices, values) = stream.visited, stream.psi_rows
+        new_x, scratch, tilted = np.empty(len(visited)), np.empty(len(visited)), np.empty(len(values))
+        kernels.tilt_rows(indptr, indices, values, log_psi, new_x, scratch, tilted)
+        new_y = np.add.reduceat(values * log_psi[indices], indptr[:-1])
+        # One epoch of lines 2-3 is x <- keep x + (1 - keep) new: convex, whatever the numbers.
+        with np.errstate(divide="ignore", under="ignore", over="ignore"):
+            keep = np.exp(stream.log_keep)
+            log_fresh = np.log(-np.expm1(stream.log_keep))
+            converged = self.sample_mean_psi
+            for _ in range(1 if self.sample_mean_psi else self.max_psi_epochs):
+                before_x, before_y = x[visited], y[visited]
+                x[visited] = np.logaddexp(stream.log_keep + before_x, log_fresh + new_x)
+                y[visited] = keep * before_y + (1 - keep) * new_y
+                change = np.maximum(
+                    np.abs(np.expm1(x[visited] - before_x)),
+                    np.abs(y[visited] - before_y) / (np.abs(before_y) + LOG_PSI_EPSILON),
+                )
+                if self.sample_mean_psi or change.max() < self.psi_tol:
+                    converged = True
+                    break
+        after = replace(
+            state,
+            log_psi_in_use=state.log_psi,
+            log_mean_psi=torch.from_numpy(log_mean_psi),
+            mean_log_psi=torch.from_numpy(mean_log_psi),
+            psi_converged=state.psi_converged and converged,
+            log_total=torch.full_like(state.log_total, -math.inf),
+        )
+        if self.warm_start and state.bias_iteration > 0:
+            theta = -state.log_rho / self.beta - state.reward_bias_max
+            log_z = state.log_average + (state.log_psi - state.log_psi_in_use)[:, None]
+            return replace(after, log_z=log_z, log_rho=-self.beta * (theta + after.reward_bias_max))
+        log_z = state.log_psi[:, None].expand_as(state.log_z).clone()  # lines 7, 8
+        return replace(after, log_z=log_z, log_rho=-self.beta)
+
+    def steps(self) -> np.ndarray:
+        """The step of a pair's n-th visit in a biasing iteration, n = 0, 1, ...; the last entry stays."""
+        if not self.clocks:
+            return np.array([self.lr_u])
+        n = np.arange(min(math.ceil(self.clock_horizon * (1 / self.clock_floor - 1)), LAST_STEP) + 1)
+        return np.asarray(np.maximum(self.clock_floor, self.clock_horizon / (self.clock_horizon + n)))
+
+    def _u_epoch(self, state: EfficientState, stream: EfficientStream) -> tuple[np.ndarray, np.ndarray, float]:
+        """(log z, log total, log rho) after an epoch of lines 9-11."""
+        reward = 0.0 if stream.noisy else stream.model.reward
+        log_g = self.beta * (reward - state.reward_bias_max) - state.mean_log_psi.numpy()
+        log_g += state.log_psi_in_use.numpy()[:, None]
+        top = state.log_z.numpy()[stream.inside].max()
+        log_z, log_total = np.where(stream.inside, state.log_z - top, 0.0), state.log_total.numpy() - top
+        log_g = np.where(stream.inside, log_g, 0.0)
+        span = max(np.abs(log_g).max(), np.abs(stream.log_factor).max(), -log_z.min(), abs(state.log_rho))
+        with np.errstate(all="ignore"):
+            if self.log_domain == "off" or (self.log_domain == "auto" and span < SAFE_RANGE):
+                tables = [np.exp(x) for x in (log_g, log_z, log_total)]
+                rho, healthy = self._stream(kernels.gauge_epoch, np.exp, state, stream, *tables)
+                if healthy:
+                    return np.log(tables[1]), np.log(tables[2]), math.log(rho)
+                if self.log_domain == "off":
+                    raise NonFiniteError(
+                        state.n_tuples,
+                        f"u or rho is no longer a positive finite number in biasing iteration {state.bias_iteration}, "
+                        f"epoch {state.epoch + 1}, at beta={self.beta:g}: set log_domain to auto",
+                    )
+            log_rho, _ = self._stream(kernels.log_gauge_epoch, np.asarray, state, stream, log_g, log_z, log_total)
+        return log_z, log_total, log_rho
+
+    def _stream(
+        self,
+        kernel: Callable[..., tuple[float, bool]],
+        number: Callable[[Any], Any],
+        state: EfficientState,
+        stream: EfficientStream,
+        g: np.ndarray,
+        z: np.ndarray,
+        total: np.ndarray,
+    ) -> tuple[float, bool]:
+        """Run a kernel over the stream, a block at a time; ``number`` makes of a logarithm what it computes with."""
+        n_states, n_actions = z.shape
+        lr_rho = self.lr_u / n_states if self.lr_rho is None else self.lr_rho
+        lr_rho = lr_rho / (state.epoch + 1) if self.clocks else lr_rho
+        visits = (stream.model.visits * state.epoch).ravel()
+        rho, factor, rho_max = number(state.log_rho), number(stream.log_factor), number(stream.log_rho_max)
+        weight = number(state.weight.log().numpy().ravel())
+        average = self.polyak and state.epoch >= self.n_epochs // 2
+        for begin in range(0, len(stream.pair), BLOCK):
+            rho, healthy = kernel(
+                stream.pair,
+                stream.after,
+                factor,
+                stream.noisy,
+                g.ravel(),
+                z.reshape(-1),
+                total.reshape(-1),
+                average,
+                weight,
+                n_actions,
+                self.steps(),
+                visits,
+                float(rho),
+                lr_rho,
+                float(rho_max),
+                self.expected_backup,
+                max(5000, z.size),
+                begin,
+                min(begin + BLOCK, len(stream.pair)),
+            )
+            if not healthy:
+                break
+        return rho, healthy
+
+
+SWITCHES = (
+    "sample_mean_psi",
+    "expected_backup",
+    "clocks",
+    "mean_reward",
+    "warm_start",
+    "polyak",
+    "certificate",
+)
+
+
+def empirical_width(part: EmpiricalProblem, log_psi: np.ndarray, policy: np.ndarray) -> float:
+    """max(TV - V) - min(T_pi V - V) on the empirical problem, V = -log(psi)/beta: g* - J(pi) there is not above it.
+
+    What ``policy`` [S, A] does in pairs that take no part is left out, and the rest normalised.
+    """
+    problem = part.problem
+    value = -log_psi[problem.states] / problem.beta
+    inside = np.where(part.used, policy, 0.0)[problem.states]
+    inside /= inside.sum(1, keepdims=True)
+    q = problem.action_value(value)
+    backed_up, _ = soft_backup(q, problem.prior, problem.beta)
+    prior = np.where(inside > 0, problem.prior, 1.0)
+    followed = (inside * q).sum(1) - kl_per_state(inside, prior) / problem.beta
+    return float((backed_up - value).max() - (followed - value).min())

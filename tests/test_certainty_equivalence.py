@@ -1,0 +1,137 @@
+"""Empirical models and certainty equivalence, against brute force and the exact solver."""
+
+import hypothesis
+import numpy as np
+import oracle
+import pytest
+import torch
+from conftest import problems, random_stream
+from hypothesis import strategies as st
+
+from erl_torch import (
+    CertaintyEquivalence,
+    InputError,
+    Status,
+    TabularMDP,
+    Transitions,
+    collect,
+    empirical_mdp,
+    solve_soft_bellman,
+)
+from erl_torch.envs.windy_cliff import WindyCliffEnv
+from erl_torch.evaluation import objective
+
+CLIFF = WindyCliffEnv().mdp
+
+
+def tuples(*rows):
+    """Rows (s, a, r, s')."""
+    s, a, r, s_next = zip(*rows, strict=True)
+    return Transitions(np.array(s), np.array(a), np.array(r, float), np.array(s_next), np.zeros(len(s), int))
+
+
+@hypothesis.settings(max_examples=30)
+@hypothesis.given(problem=problems(), noise=st.sampled_from((0.0, 1.0)))
+def test_statistics_are_those_of_the_tuples(problem, noise):
+    rng, mdp, _ = problem
+    data = random_stream(rng, mdp, 200)
+    data = Transitions(data.s, data.a, data.r + noise * rng.standard_normal(200), data.s_next, data.a_next)
+    model = empirical_mdp(data, *mdp.reward.shape)
+    p = model.transition.toarray().reshape(*mdp.reward.shape, -1)
+    for s, a in np.ndindex(mdp.reward.shape):
+        here = (data.s == s) & (data.a == a)
+        assert model.visits[s, a] == here.sum()
+        if here.any():
+            np.testing.assert_allclose(p[s, a], np.bincount(data.s_next[here], minlength=mdp.n_states) / here.sum())
+            assert model.reward[s, a] == pytest.approx(data.r[here].mean())
+            variance = data.r[here].var(ddof=1) if here.sum() > 1 else 0.0
+            assert model.reward_variance[s, a] == pytest.approx(variance, abs=1e-12)
+            if not noise:
+                assert model.reward[s, a] == data.r[here][0]  # to the last bit
+
+
+def test_rewards_by_successor():
+    model = empirical_mdp(tuples((0, 0, 1.0, 0), (0, 0, 3.0, 0), (0, 0, 5.0, 1), (1, 0, 0.0, 0)), 2, 1)
+    np.testing.assert_array_equal(model.reward_given_next, [2.0, 5.0, 0.0])
+
+
+@hypothesis.settings(max_examples=30)
+@hypothesis.given(problem=problems(), beta=st.floats(0.1, 10.0))
+def test_full_data_is_solved_as_the_model_it_shows(problem, beta):
+    """Every pair visited: the exact solver on the frequencies gives the same policy and theta."""
+    rng, mdp, prior = problem
+    data = random_stream(rng, mdp, 3000)
+    model = empirical_mdp(data, *mdp.reward.shape)
+    hypothesis.assume(model.visits.all())
+    exact = solve_soft_bellman(TabularMDP(model.transition, model.reward), beta, prior, tol=1e-12)
+    found = CertaintyEquivalence(beta, prior_policy=prior).fit(data, *mdp.reward.shape)
+    assert found.status is Status.CONVERGED
+    assert found.theta == pytest.approx(exact.theta, abs=1e-9)
+    np.testing.assert_allclose(found.policy, exact.policy, atol=1e-7)
+    biasing = oracle.biasing_iterations(
+        model.transition.toarray().reshape(*mdp.reward.shape, -1), model.reward, prior, beta, 12
+    )[-1]
+    assert found.theta == pytest.approx(biasing.theta, abs=1e-6)
+
+
+def test_a_pair_never_visited_is_an_action_that_is_not_there():
+    """Against the best of all policies that never take it, KL counted with the whole prior: a fine search."""
+    rng = np.random.default_rng(3)
+    rows = [(s, a, -rng.random(), int(rng.integers(2))) for s in (0, 1) for a in (0, 1) for _ in range(20)]
+    rows = [row for row in rows if row[:2] != (1, 1)]
+    data, prior = tuples(*rows, (0, 0, -0.5, 1), (1, 0, -0.5, 0)), np.array([[0.3, 0.7], [0.4, 0.6]])
+    found = CertaintyEquivalence(3.0, prior_policy=prior).fit(data, 2, 2)
+    assert found.policy[1].tolist() == [1.0, 0.0]
+    model = empirical_mdp(data, 2, 2)
+    p = model.transition.toarray().reshape(2, 2, 2)
+    p[1, 1] = p[1, 0]  # not taken
+    mdp = TabularMDP(p, np.where(model.visits > 0, model.reward, 1e3))
+    values = [objective(mdp, np.array([[x, 1 - x], [1.0, 0.0]]), prior, 3.0) for x in np.linspace(0.001, 0.999, 2001)]
+    assert -found.theta == pytest.approx(max(values), abs=1e-6)
+    assert found.u[1, 1] == 0
+    weight = found.u.numpy() * prior
+    np.testing.assert_allclose(found.policy, weight / weight.sum(1, keepdims=True), atol=1e-12)
+
+
+def test_states_that_lead_nowhere_are_left_out_and_keep_the_prior():
+    rows = [(0, 0, -1.0, 1), (1, 0, -1.0, 0), (0, 1, 0.0, 2), (2, 0, 0.0, 3)]  # 3 is never left, so neither is 2
+    found = CertaintyEquivalence(1.0).fit(tuples(*rows), 4, 2)
+    assert "[2]" in found.message
+    np.testing.assert_array_equal(found.policy, [[1, 0], [1, 0], [0.5, 0.5], [0.5, 0.5]])
+    # One action left of two, everywhere: KL = log 2 a step.
+    assert found.theta == pytest.approx(1 + np.log(2))
+
+
+def test_several_closed_sets_the_most_visited_is_solved():
+    rows = [(0, 0, -1.0, 0)] * 2 + [(1, 0, -2.0, 2), (2, 0, -4.0, 1)] * 2
+    found = CertaintyEquivalence(1.0).fit(tuples(*rows), 3, 1)
+    assert found.status is Status.REDUCIBLE
+    assert "[1, 2]" in found.message
+    assert found.theta == pytest.approx(3.0)
+
+
+def test_a_stream_without_cycles_is_refused():
+    with pytest.raises(InputError, match="never returns"):
+        CertaintyEquivalence().fit(tuples((0, 0, 0.0, 1)), 2, 1)
+
+
+def test_interface():
+    data, learner = collect(CLIFF, 20, 1000, 0), CertaintyEquivalence(10.0)
+    (state,) = learner.iterate(data, 15, 4)
+    solution = learner.fit(data, 15, 4)
+    assert torch.equal(state.policy, solution.policy)
+    assert state.metrics()["theta"] == solution.theta == solution.history["theta"][0]
+    assert solution.n_steps == state.n_tuples == 20_000
+    assert solution.theta_bounds is None  # nothing is proven of the true MDP
+    start = learner.init(15, 4)
+    assert learner.solution(start).status is Status.STOPPED
+    assert (start.policy == 0.25).all()
+
+
+def test_loss_falls_as_one_over_tuples():
+    theta = solve_soft_bellman(CLIFF, 10.0).theta
+    gaps = []
+    for n in (200, 2000):
+        fits = [CertaintyEquivalence().fit(collect(CLIFF, n, 1000, seed), 15, 4) for seed in range(6)]
+        gaps.append(np.mean([-theta - objective(CLIFF, f.policy.numpy(), np.full((15, 4), 0.25), 10.0) for f in fits]))
+    assert 0 <= gaps[1] < gaps[0] / 4
