@@ -92,8 +92,8 @@ def main() -> None:
         )
     lines += [
         "\nThe rewards of the cliff do not vary for the same (s,a), so the mean reward has nothing to do here, and the",
-        "published steps never meet the certificate. Without a warm start each iteration begins with rho = exp(-beta), here",
-        "29 nats above its value (Delta is 2.9), and a falling lr_rho of .005/15 does not get down in 15 epochs: with",
+        "published steps never meet the certificate. Without a warm start each iteration begins with rho = exp(-beta),",
+        "here 29 nats above its value (Delta is 2.9); a falling lr_rho of .005/15 does not get down in 15 epochs. With",
         "`lr_rho=0.005` that variant was certified to 4e-5 on one stream.\n",
         "![loss of each variant](ablation.png)",
     ]
