@@ -28,7 +28,8 @@ Options, each alone (published: all off, ``unvisited="initial"``; then this *is*
     4. ``mean_reward``      r(s,a) is the mean over all visits. Off: each tuple's own r, that is an average of
                             exp(beta r), optimistic about noise in r.
     5. ``warm_start``       u and theta are carried over to the next biasing iteration (rho = exp(-beta (theta +
-                            Delta)) with its Delta). Off: u = 1, rho = exp(-beta), lines 7-8.
+                            Delta)) with its Delta). Off: u = 1, rho = exp(-beta), lines 7-8, and with clocks a larger
+                            lr_rho is needed: rho may have to fall by exp(-beta Delta) in every iteration.
     6. ``polyak``           line 12 and the policy take the mean of z over the visits of the second half of an
                             iteration's epochs. Off: the last z.
     7. ``log_domain``       "on": z and rho as logarithms, for any beta; "off": as numbers; "auto": as numbers where
@@ -237,11 +238,11 @@ class EfficientS1:
         checks.one_of("unvisited", self.unvisited, ("exclude", "initial"))
 
     @classmethod
-    def published(cls, **options: object) -> EfficientS1:
+    def published(cls, beta: float = 10.0, **options: object) -> EfficientS1:
         """Every option at the paper's value, unless given: Algorithm S1 itself."""
         off: dict[str, object] = dict.fromkeys(SWITCHES, False)
         paper: dict[str, object] = {"log_domain": "off", "unvisited": "initial", "n_epochs": 15, "n_bias": 6}
-        return cls(**(off | paper | options))  # type: ignore[arg-type]
+        return cls(beta, **(off | paper | options))  # type: ignore[arg-type]
 
     # -- the whole run ------------------------------------------------------------------------------
 

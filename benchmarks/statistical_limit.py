@@ -1,0 +1,282 @@
+"""EfficientS1 beside certainty equivalence, the limit of what the data allow, and published S1; intervals; online mode.
+
+    python benchmarks/statistical_limit.py cliff [n_seeds]     the paper's cliff, default 20 seeds
+    python benchmarks/statistical_limit.py breadth [n_seeds]   mazes, FrozenLake, three behaviour policies, default 4
+    python benchmarks/statistical_limit.py beta                beta .1 to 5000 on the cliff
+    python benchmarks/statistical_limit.py coverage [n]        95% intervals of theta, default 300 datasets
+    python benchmarks/statistical_limit.py noise [n_seeds]     rewards with variance up to 4, default 10
+    python benchmarks/statistical_limit.py online [n_seeds]    loss against tuples, default 8
+
+Each prints a Markdown table and writes it to docs/results/statistical_limit_<what>.md with the figures in .json
+(online: .png too). Loss is g* - J of the policy in the true MDP, exact, reward a step. Minutes each, on one core.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import scipy.sparse as sp
+from tqdm import tqdm
+
+from erl_torch import (
+    AlgorithmS1,
+    CertaintyEquivalence,
+    EfficientS1,
+    TabularMDP,
+    Transitions,
+    bootstrap_theta,
+    collect,
+    empirical_mdp,
+    solve_soft_bellman,
+    theta_uncertainty,
+)
+from erl_torch.envs.windy_cliff import WindyCliffEnv
+from erl_torch.evaluation import kl_per_state, objective
+from erl_torch.files import write_json
+
+ROOT = Path(__file__).parents[1]
+CLIFF = WindyCliffEnv().mdp
+
+
+def maze(i: int) -> TabularMDP:
+    """One of the authors' 10x10 mazes of the tests."""
+    with np.load(ROOT / "tests" / "data" / "windy_mazes.npz") as d:
+        r = d[f"m{i:02d}_R"]
+        rows = (d[f"m{i:02d}_data"], d[f"m{i:02d}_indices"], d[f"m{i:02d}_indptr"])
+        return TabularMDP(sp.csr_array(rows, shape=(r.size, len(r))), r, d[f"m{i:02d}_start"])
+
+
+def frozen_lake() -> TabularMDP:
+    """FrozenLake-v1, slippery; a step that ends an episode leads to the start."""
+    table = gym.make("FrozenLake-v1", is_slippery=True).unwrapped.P  # type: ignore[attr-defined]
+    p, r = np.zeros((len(table), 4, len(table))), np.zeros((len(table), 4))
+    for s, actions in table.items():
+        for a, outcomes in actions.items():
+            for chance, s_next, reward, done in outcomes:
+                p[s, a, 0 if done else s_next] += chance
+                r[s, a] += chance * reward
+    return TabularMDP(p, r, np.eye(len(table))[0])
+
+
+def uniform(mdp: TabularMDP) -> np.ndarray:
+    return np.full(mdp.reward.shape, 1 / mdp.n_actions)
+
+
+def part(data: Transitions, begin: int, end: int) -> Transitions:
+    return Transitions(*(getattr(data, name)[begin:end] for name in ("s", "a", "r", "s_next", "a_next")))
+
+
+def losses(mdp: TabularMDP, beta: float, exact: Any, policy: np.ndarray) -> tuple[float, float]:
+    """(g* - J, mean KL(optimal || policy)); the KL is over states that the start leads to."""
+    kl = kl_per_state(exact.policy.numpy(), policy)
+    return -exact.theta - objective(mdp, policy, uniform(mdp), beta), float(kl.mean())
+
+
+def write(what: str, command: str, text: str, header: Sequence[str], rows: list[list[Any]]) -> None:
+    lines = [f"# {text[0].upper()}{text[1:].splitlines()[0]}\n", f"    {command}\n", *text.splitlines()[1:], ""]
+    lines += [f"| {' | '.join(header)} |", "|" + "---|" * len(header)]
+    lines += [f"| {' | '.join(x if isinstance(x, str) else f'{x:.3g}' for x in row)} |" for row in rows]
+    path = ROOT / "docs" / "results" / f"statistical_limit_{what}"
+    path.with_suffix(".md").write_text("\n".join(lines) + "\n")
+    write_json(path.with_suffix(".json"), {"command": command, "columns": list(header), "rows": rows})
+    print("\n".join(lines))
+
+
+def cliff(command: str, n_seeds: int = 20) -> None:
+    exact = solve_soft_bellman(CLIFF, 10.0)
+    learners: dict[str, Any] = {
+        "published S1, as the authors' script reads it": AlgorithmS1(rho_init="carry", self_loop="old"),
+        "published S1, as listed": AlgorithmS1(),
+        "EfficientS1, 15 epochs x 6": EfficientS1(n_epochs=15, n_bias=6),
+        "EfficientS1, defaults (3 x 30)": EfficientS1(),
+        "certainty equivalence": CertaintyEquivalence(),
+    }
+    found = np.empty((len(learners), n_seeds, 4))
+    for seed in tqdm(range(n_seeds), disable=None):
+        data = collect(CLIFF, 500, 1000, seed)
+        for i, learner in enumerate(learners.values()):
+            s = learner.fit(data, 15, 4)
+            passes = s.n_steps / len(data)
+            found[i, seed] = *losses(CLIFF, 10.0, exact, s.policy.numpy()), abs(s.theta - exact.theta), passes
+    mean = found.mean(1)
+    rows = [
+        [name, g, g / mean[-1, 0], k, k / mean[-1, 1], t, n] for name, (g, k, t, n) in zip(learners, mean, strict=True)
+    ]
+    text = f"windy cliff, beta 10, 500,000 tuples\nMeans over {n_seeds} streams of the uniform prior."
+    write("cliff", command, text, ["learner", "loss", "x CE", "KL", "x CE", "error of theta", "passes"], rows)
+
+
+def breadth(command: str, n_seeds: int = 4) -> None:
+    problems = [
+        *((f"maze {i}, 10x10", maze(i), beta) for i in (0, 1) for beta in (5.0, 20.0)),
+        *(("FrozenLake-v1 slippery, restart", frozen_lake(), beta) for beta in (5.0, 20.0)),
+        ("windy cliff", CLIFF, 10.0),
+    ]
+    rows = []
+    for name, mdp, beta in tqdm(problems, disable=None):
+        exact = solve_soft_bellman(mdp, beta)
+        best = exact.policy.numpy()
+        poor = 1 / np.maximum(best, 0.02)
+        behaviours = {
+            "prior": None,
+            "half optimum": 0.5 * best + 0.5 * uniform(mdp),
+            "poor": poor / poor.sum(1, keepdims=True),
+        }
+        for kind, behaviour in behaviours.items():
+            found = np.empty((2, n_seeds, 2))
+            status = []
+            for seed in range(n_seeds):
+                data = collect(mdp, 500, 1000, seed, behaviour)
+                for i, learner in enumerate((EfficientS1(beta), CertaintyEquivalence(beta))):
+                    s = learner.fit(data, *mdp.reward.shape)  # type: ignore[attr-defined]
+                    found[i, seed] = losses(mdp, beta, exact, s.policy.numpy())[0], s.n_steps / len(data)
+                    status += [s.status.name] if i == 0 else []
+            ours, limit = found[:, :, 0]
+            worst = float((ours / limit).max())
+            certified = f"{status.count('CONVERGED')} of {n_seeds}"
+            row = [name, beta, kind, ours.mean(), limit.mean(), ours.mean() / limit.mean(), worst, certified]
+            rows.append([*row, found[0, :, 1].mean()])
+    header = ["problem", "beta", "behaviour", "loss", "loss of CE", "ratio", "worst ratio", "certified", "passes"]
+    text = f"""EfficientS1 beside certainty equivalence on the same streams
+Default settings, 500,000 tuples, means over {n_seeds} streams. Behaviour: the uniform prior; half the optimal policy
+and half the prior; a poor policy, proportional to 1/max(optimal, .02), which has full support."""
+    write("breadth", command, text, header, rows)
+
+
+def beta(command: str, n_seeds: int = 1) -> None:
+    rows = []
+    for beta in tqdm((0.1, 1.0, 10.0, 50.0, 200.0, 1000.0, 5000.0), disable=None):
+        exact = solve_soft_bellman(CLIFF, beta)
+        data = collect(CLIFF, 500, 1000, 0)
+        s, ce, paper = (learner(beta).fit(data, 15, 4) for learner in (EfficientS1, CertaintyEquivalence, _published))
+        loss = [losses(CLIFF, beta, exact, x.policy.numpy())[0] for x in (s, ce, paper)]
+        error = [abs(x.theta - exact.theta) for x in (s, ce, paper)]
+        rows.append([beta, *loss[:2], loss[2], *error, s.status.name, paper.status.name])
+    header = [
+        "beta",
+        "loss",
+        "loss of CE",
+        "loss of published S1",
+        "error of theta",
+        "CE",
+        "published",
+        "status",
+        "pub.",
+    ]
+    write("beta", command, "any temperature: windy cliff, 500,000 tuples\n", header, rows)
+
+
+def _published(beta: float) -> Any:
+    """Published S1; EfficientS1's form of it, which ends with a status where numbers leave their range."""
+    return EfficientS1.published(beta)
+
+
+def coverage(command: str, n: int = 300) -> None:
+    rows = []
+    cases = [("windy cliff", CLIFF, 10.0, 500, 0.0), ("windy cliff, reward variance 4", CLIFF, 10.0, 500, 2.0)]
+    cases += [("windy cliff", CLIFF, 10.0, 200, 0.0), ("FrozenLake-v1", frozen_lake(), 5.0, 200, 0.0)]
+    for name, mdp, b, episodes, noise in cases:
+        theta = solve_soft_bellman(mdp, b).theta
+        hits = boot_hits = 0
+        z, n_boot = [], min(n, 100)
+        for seed in tqdm(range(n), disable=None):
+            model = empirical_mdp(_noisy(collect(mdp, episodes, 1000, seed), seed, noise), *mdp.reward.shape)
+            estimate = theta_uncertainty(model, b)
+            low, high = estimate.interval()
+            hits += low <= theta <= high
+            z.append((estimate.value - theta) / estimate.standard_error)
+            if seed < n_boot and episodes == 200:
+                low, high = bootstrap_theta(model, b, n_resamples=100).interval()
+                boot_hits += low <= theta <= high
+        boot = f"{boot_hits / n_boot:.3f} ({n_boot})" if episodes == 200 else "-"
+        rows.append([name, b, episodes * 1000, f"{hits / n:.3f}", float(np.mean(z)), float(np.std(z)), boot])
+    header = ["problem", "beta", "tuples", "coverage", "mean z", "sd z", "bootstrap (datasets)"]
+    text = f"""coverage of the 95% interval of theta
+{n} datasets; z = (estimate - theta)/standard error. The bootstrap has 100 resamples a dataset."""
+    write("coverage", command, text, header, rows)
+
+
+def noise(command: str, n_seeds: int = 10) -> None:
+    rows = []
+    for b in (1.0, 2.0):
+        theta = solve_soft_bellman(CLIFF, b).theta
+        for variance in (0.0, 1.0, 4.0):
+            z, ours, paper, half = [], [], [], []
+            for seed in range(n_seeds):
+                data = _noisy(collect(CLIFF, 500, 1000, seed), seed, variance**0.5)
+                estimate = theta_uncertainty(empirical_mdp(data, 15, 4), b)
+                ours.append(EfficientS1(b).fit(data, 15, 4).theta)
+                paper.append(AlgorithmS1(b).fit(data, 15, 4).theta - theta)
+                z.append(abs(ours[-1] - theta) / estimate.standard_error)
+                half.append(1.96 * estimate.standard_error)
+            inside = f"{sum(x < 1.96 for x in z)} of {n_seeds}"
+            row = [b, variance, theta, float(np.mean(ours)) - theta, float(np.mean(half)), inside]
+            rows.append([*row, float(np.mean(paper)), b * variance / 2])
+    header = ["beta", "variance", "theta", "error", "half interval", "inside", "error of published S1", "beta var/2"]
+    text = f"""rewards that vary for the same (s,a)
+Windy cliff, 500,000 tuples, {n_seeds} streams, normal noise of mean 0 on every reward. Published S1 averages
+exp(beta r), which is exp(beta^2 variance/2) too large: its theta is too low by beta variance/2 if it converges."""
+    write("noise", command, text, header, rows)
+
+
+def _noisy(data: Transitions, seed: int, scale: float) -> Transitions:
+    r = data.r + scale * np.random.default_rng(seed).standard_normal(len(data))
+    return Transitions(data.s, data.a, r, data.s_next, data.a_next)
+
+
+def online(command: str, n_seeds: int = 8) -> None:
+    marks = np.round(np.logspace(3.5, 6.5, 13), -2).astype(int)
+    exact = solve_soft_bellman(CLIFF, 10.0)
+    found = np.empty((2, n_seeds, len(marks)))
+    edges = [0, *marks.tolist()]
+    for seed in tqdm(range(n_seeds), disable=None):
+        data = collect(CLIFF, 1 + edges[-1] // 1000, 1000, seed)
+        chunks = (part(data, i, j) for i, j in pairwise(edges))
+        for m, state in enumerate(EfficientS1().online(chunks, 15, 4)):
+            ce = CertaintyEquivalence().fit(part(data, 0, edges[m + 1]), 15, 4)
+            for i, policy in enumerate((state.policy, ce.policy)):
+                found[i, seed, m] = losses(CLIFF, 10.0, exact, policy.numpy())[0]
+    mean = found.mean(1)
+    slopes = [float(np.polyfit(np.log(marks), np.log(row), 1)[0]) for row in mean]
+    rows = [[int(n), float(a), float(b), float(a / b)] for n, a, b in zip(marks, *mean, strict=True)]
+    text = f"""online mode: loss against tuples
+Windy cliff, beta 10, uniform prior, one pass, no tuple kept; means over {n_seeds} streams. Slope of log loss in log
+tuples over the three decades: online {slopes[0]:.2f}, certainty equivalence {slopes[1]:.2f}."""
+    write("online", command, text, ["tuples", "online", "certainty equivalence", "ratio"], rows)
+
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6, 4.2), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    for name, color, runs, slope in zip(
+        ("online", "certainty equivalence"), ("C0", "black"), found, slopes, strict=True
+    ):
+        axes.loglog(marks, runs.T, color=color, alpha=0.2, lw=0.7)
+        axes.loglog(marks, runs.mean(0), "o-", color=color, ms=4, label=f"{name}, mean (slope {slope:.2f})")
+    axes.loglog(marks, mean[1, -1] * marks[-1] / marks, "--", color="gray", label="slope -1")
+    axes.set_xlabel("tuples seen, once each")
+    axes.set_ylabel("loss g* - J (reward a step)")
+    axes.set_title(f"Windy cliff, beta 10, {n_seeds} streams")
+    axes.grid(alpha=0.3)
+    axes.legend()
+    figure.savefig(ROOT / "docs" / "results" / "statistical_limit_online.png", dpi=130)
+
+
+def main() -> None:
+    tasks = {f.__name__: f for f in (cliff, breadth, beta, coverage, noise, online)}
+    if len(sys.argv) < 2 or sys.argv[1] not in tasks:
+        sys.exit(__doc__)
+    numbers = [int(x) for x in sys.argv[2:3]]
+    tasks[sys.argv[1]](" ".join(["python benchmarks/statistical_limit.py", *sys.argv[1:]]), *numbers)
+
+
+if __name__ == "__main__":
+    main()
