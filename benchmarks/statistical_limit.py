@@ -33,6 +33,7 @@ from erl_torch import (
     bootstrap_theta,
     collect,
     empirical_mdp,
+    estimate_mdp,
     solve_soft_bellman,
     theta_uncertainty,
 )
@@ -112,11 +113,18 @@ def cliff(command: str, n_seeds: int = 20) -> None:
     write("cliff", command, text, ["learner", "loss", "x CE", "KL", "x CE", "error of theta", "passes"], rows)
 
 
+def mountain_car() -> TabularMDP:
+    """Episodes of 50 steps from any cell."""
+    model = estimate_mdp("mountain_car").mdp
+    return TabularMDP(model.transition, model.reward)
+
+
 def breadth(command: str, n_seeds: int = 4) -> None:
     problems = [
         *((f"maze {i}, 10x10", maze(i), beta) for i in (0, 1) for beta in (5.0, 20.0)),
         *(("FrozenLake-v1 slippery, restart", frozen_lake(), beta) for beta in (5.0, 20.0)),
         ("windy cliff", CLIFF, 10.0),
+        ("MountainCar, 12^2 bins", mountain_car(), 2.0),
     ]
     rows = []
     for name, mdp, beta in tqdm(problems, disable=None):
@@ -132,7 +140,7 @@ def breadth(command: str, n_seeds: int = 4) -> None:
             found = np.empty((2, n_seeds, 2))
             status = []
             for seed in range(n_seeds):
-                data = collect(mdp, 500, 1000, seed, behaviour)
+                data = collect(mdp, *((10_000, 50) if "bins" in name else (500, 1000)), seed, behaviour)
                 for i, learner in enumerate((EfficientS1(beta), CertaintyEquivalence(beta))):
                     s = learner.fit(data, *mdp.reward.shape)  # type: ignore[attr-defined]
                     found[i, seed] = losses(mdp, beta, exact, s.policy.numpy())[0], s.n_steps / len(data)

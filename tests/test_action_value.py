@@ -348,7 +348,8 @@ def test_learners_share_one_interface(cliff, name):
     assert solution.n_steps == states[-1].n_tuples
     np.testing.assert_array_equal(solution.policy, states[-1].policy)
     assert set(solution.history) == set(state.metrics())
-    assert learner.solution(states[0]).status is Status.STOPPED
+    if len(states) > 1:
+        assert learner.solution(states[0]).status is Status.STOPPED
 
 
 # -- nearly reducible chains ------------------------------------------------------------------------------
