@@ -25,6 +25,7 @@ from tqdm import tqdm
 import erl_torch
 from erl_torch import checks, kernels, pictures
 from erl_torch.board import EXACT_LAYOUT, LEARNER_LAYOUT, S1_LAYOUT, Board
+from erl_torch.chains import SingularChainError
 from erl_torch.checks import InputError
 from erl_torch.config import check_keys
 from erl_torch.empirical import empirical_mdp
@@ -202,7 +203,8 @@ class _Learning:
         """theta* with its error, as the counts of the stream alone have it; None where that is no small problem."""
         if self.sizes[0] > SMALL:
             return None
-        with contextlib.suppress(InputError):
+        # Streams that return nowhere, and chains that fall apart in double precision, have no such figure.
+        with contextlib.suppress(InputError, SingularChainError):
             return theta_uncertainty(empirical_mdp(self.data, *self.sizes), self.learner.beta, prior)
         return None
 

@@ -130,7 +130,7 @@ BAD_VALUES = {
 }
 
 
-@hypothesis.settings(max_examples=150, suppress_health_check=[hypothesis.HealthCheck.function_scoped_fixture])
+@hypothesis.settings(max_examples=100, suppress_health_check=[hypothesis.HealthCheck.function_scoped_fixture])
 @hypothesis.given(data=st.data())
 def test_bad_values_get_one_line_that_names_them(tmp_path, data):
     key = data.draw(st.sampled_from(sorted(BAD_VALUES)))
