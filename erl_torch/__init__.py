@@ -18,9 +18,10 @@ if TYPE_CHECKING:
     from erl_torch.envs.rollout import collect_rollouts, rollout
     from erl_torch.evaluation import Evaluation, evaluate
     from erl_torch.experience import collect
-    from erl_torch.learners.algorithm_s1 import AlgorithmS1, NonFiniteError, S1State
+    from erl_torch.learners.algorithm_s1 import AlgorithmS1, S1State
     from erl_torch.learners.certainty_equivalence import CertaintyEquivalence
     from erl_torch.learners.efficient_s1 import EfficientS1
+    from erl_torch.learners.fitting import NonFiniteError
     from erl_torch.mdp import TabularMDP
     from erl_torch.models import MeanRewardWarning, tabular_mdp
     from erl_torch.solution import Solution, Status
@@ -40,7 +41,7 @@ _HOME = {
     "Evaluation": "evaluation",
     "InputError": "checks",
     "MeanRewardWarning": "models",
-    "NonFiniteError": "learners.algorithm_s1",
+    "NonFiniteError": "learners.fitting",
     "S1State": "learners.algorithm_s1",
     "Solution": "solution",
     "bootstrap_theta": "uncertainty",

@@ -14,10 +14,11 @@ from erl_torch.learners.action_value import (
     SoftQ,
     ULearning,
 )
-from erl_torch.learners.algorithm_s1 import AlgorithmS1, NonFiniteError, S1State
+from erl_torch.learners.algorithm_s1 import AlgorithmS1, S1State
 from erl_torch.learners.certainty_equivalence import CertaintyEquivalence
 from erl_torch.learners.efficient_s1 import EfficientS1, EfficientState
 from erl_torch.learners.exact import Exact, ExactState
+from erl_torch.learners.fitting import NonFiniteError
 from erl_torch.learners.z_learning import ZLearning
 
 LEARNERS: dict[str, Any] = {

@@ -39,7 +39,7 @@ import torch
 
 from erl_torch import checks, kernels
 from erl_torch.checks import InputError
-from erl_torch.learners.algorithm_s1 import NonFiniteError
+from erl_torch.learners.fitting import NonFiniteError, run_to_end
 from erl_torch.mdp import check_policy
 from erl_torch.solution import Solution, Status
 from erl_torch.transitions import Transitions
@@ -133,15 +133,7 @@ class ActionValueLearner:
 
         Raises InputError: a state or action out of range, or a prior policy of the wrong shape.
         """
-        state = self.init(n_states, n_actions)
-        history: list[dict[str, float]] = []
-        failure: NonFiniteError | None = None
-        try:
-            for state in self.iterate(transitions, n_states, n_actions):
-                history.append(state.metrics())
-        except NonFiniteError as error:
-            failure = error
-        return self.solution(state, history, failure)
+        return run_to_end(self, transitions, n_states, n_actions)
 
     def iterate(self, transitions: Transitions, n_states: int, n_actions: int) -> Iterator[ActionValueState]:
         """Yield the state after each pass, n_epochs times. Raises NonFiniteError."""

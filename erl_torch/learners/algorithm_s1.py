@@ -69,23 +69,13 @@ import torch
 from erl_torch import checks, kernels
 from erl_torch.checks import InputError
 from erl_torch.learners import listing
+from erl_torch.learners.fitting import NonFiniteError, run_to_end
 from erl_torch.mdp import check_policy
 from erl_torch.solution import Solution, Status
 from erl_torch.transitions import Transitions
 
 LOG_PSI_EPSILON = 1e-10  # keeps the relative error of <log psi> finite where it is 0
 BLOCK = 1 << 24  # tuples a compiled call, so that signals are served several times a second
-
-
-class NonFiniteError(ArithmeticError):
-    """A table left the positive finite numbers. ``step`` counts u updates; ``cause`` names tuple and values."""
-
-    def __init__(self, step: int, cause: str) -> None:
-        super().__init__(step, cause)
-        self.step, self.cause = step, cause
-
-    def __str__(self) -> str:
-        return f"step {self.step}: {self.cause}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,15 +215,7 @@ class AlgorithmS1:
         Raises:
             InputError: a state or action out of range, or a prior policy of the wrong shape.
         """
-        state = self.init(n_states, n_actions)
-        history: list[dict[str, float]] = []
-        failure: NonFiniteError | None = None
-        try:
-            for state in self.iterate(transitions, n_states, n_actions):
-                history.append(state.metrics())
-        except NonFiniteError as error:
-            failure = error
-        return self.solution(state, history, failure)
+        return run_to_end(self, transitions, n_states, n_actions)
 
     def iterate(self, transitions: Transitions, n_states: int, n_actions: int) -> Iterator[S1State]:
         """Yield the state after each epoch of the u phase: n_bias * n_epochs times.

@@ -70,7 +70,8 @@ from erl_torch import checks, kernels
 from erl_torch.checks import InputError
 from erl_torch.empirical import EmpiricalMDP, EmpiricalProblem, empirical_mdp
 from erl_torch.evaluation import kl_per_state
-from erl_torch.learners.algorithm_s1 import BLOCK, LOG_PSI_EPSILON, NonFiniteError
+from erl_torch.learners.algorithm_s1 import BLOCK, LOG_PSI_EPSILON
+from erl_torch.learners.fitting import NonFiniteError, run_to_end
 from erl_torch.mdp import check_policy
 from erl_torch.solution import Solution, Status
 from erl_torch.solvers.problem import soft_backup
@@ -256,15 +257,7 @@ class EfficientS1:
             InputError: a state or action out of range, a prior policy of the wrong shape, or a stream that never
                 returns to any state.
         """
-        state = self.init(n_states, n_actions)
-        history: list[dict[str, float]] = []
-        failure: NonFiniteError | None = None
-        try:
-            for state in self.iterate(transitions, n_states, n_actions):
-                history.append(state.metrics())
-        except NonFiniteError as error:
-            failure = error
-        return self.solution(state, history, failure)
+        return run_to_end(self, transitions, n_states, n_actions)
 
     def iterate(self, transitions: Transitions, n_states: int, n_actions: int) -> Iterator[EfficientState]:
         """Yield the state after each epoch: n_bias * n_epochs times, or until certified."""

@@ -1,0 +1,33 @@
+"""What ``fit`` is for every learner that streams: all of ``iterate``, and its record."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from erl_torch.solution import Solution
+from erl_torch.transitions import Transitions
+
+
+class NonFiniteError(ArithmeticError):
+    """A table left the positive finite numbers. ``step`` counts u updates; ``cause`` names tuple and values."""
+
+    def __init__(self, step: int, cause: str) -> None:
+        super().__init__(step, cause)
+        self.step, self.cause = step, cause
+
+    def __str__(self) -> str:
+        return f"step {self.step}: {self.cause}"
+
+
+def run_to_end(learner: Any, transitions: Transitions, n_states: int, n_actions: int) -> Solution:
+    """The solution of the last good state of ``learner.iterate``, with one ``metrics()`` of history for each."""
+    state = learner.init(n_states, n_actions)
+    history: list[dict[str, float]] = []
+    failure: NonFiniteError | None = None
+    try:
+        for state in learner.iterate(transitions, n_states, n_actions):
+            history.append(state.metrics())
+    except NonFiniteError as error:
+        failure = error
+    solution: Solution = learner.solution(state, history, failure)
+    return solution
