@@ -16,10 +16,11 @@ import scipy.sparse.linalg as spla
 
 from erl_torch import kernels
 from erl_torch.chains import RegenerativeLU, SingularChainError, classes
-from erl_torch.experience import batched, policy_cdf, reset, sampling_tables
+from erl_torch.experience import batched, reset
 from erl_torch.mdp import TabularMDP, check_policy
 from erl_torch.models import known_mdp, sizes
 from erl_torch.rng import Streams
+from erl_torch.sampling import policy_cdf, sampling_tables
 
 DENSE_STATES = 2000  # up to here a nearly reducible chain is solved densely: seconds, 32 MB
 

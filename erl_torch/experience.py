@@ -23,11 +23,12 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from erl_torch import checks, kernels
+from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.mdp import TabularMDP, check_policy
 from erl_torch.models import changed_by, known_mdp, sizes
 from erl_torch.rng import Streams, streams
+from erl_torch.sampling import Sampler
 from erl_torch.transitions import Transitions
 
 BLOCK = 1_000_000  # steps a compiled call, so that signals and progress bars are served
@@ -105,39 +106,22 @@ def _simulate(
     report: Report,
 ) -> Transitions:
     n = n_episodes * episode_length
-    integers = [np.empty(n, np.int32) for _ in range(4)]
-    s, a, s_next, a_next = integers
-    r = np.empty(n)
-    tables = (
-        *sampling_tables(mdp),
-        policy_cdf(behaviour),
-        policy_cdf(prior),
-        on_prior,
-        episode_length,
-        rng.environment,
-        rng.behaviour,
-    )
-    # Whole episodes a block: the kernel starts each block with a fresh one.
-    block = max(1, BLOCK // episode_length) * episode_length
-    for begin in range(0, n, block):
-        part = slice(begin, min(n, begin + block))
-        kernels.simulate(*tables, s[part], a[part], r[part], s_next[part], a_next[part])
+    pair, pair_next = np.empty(n, np.int32), np.empty(n, np.int32)
+    sampler = Sampler(mdp, [rng], episode_length, behaviour, prior, on_prior)
+    for begin in range(0, n, BLOCK):
+        part = slice(begin, min(n, begin + BLOCK))
+        here, _, there = sampler.take(part.stop - begin)
+        pair[part], pair_next[part] = here[:, 0], there[:, 0]
         report(part.stop)
-    return Transitions(s, a, r, s_next, a_next)
+    sampler.give_back()
+    return of_pairs(pair, pair_next, mdp.reward)
 
 
-def sampling_tables(mdp: TabularMDP) -> tuple[np.ndarray, ...]:
-    """(indptr, indices, cdf, reward, start cdf) as the sampling kernels take them."""
-    p = mdp.transition
-    start_cdf = kernels.cumulative_rows(np.array([0, mdp.n_states]), mdp.start)
-    return p.indptr, p.indices, kernels.cumulative_rows(p.indptr, p.data), mdp.reward, start_cdf
-
-
-def policy_cdf(policy: np.ndarray) -> np.ndarray:
-    """Running sums of each row, flat [S*A]."""
-    n_states, n_actions = policy.shape
-    rows = np.arange(0, n_states * n_actions + 1, n_actions)
-    return np.asarray(kernels.cumulative_rows(rows, policy.ravel()))
+def of_pairs(pair: np.ndarray, pair_next: np.ndarray, reward: np.ndarray) -> Transitions:
+    """The tuples of pairs s * A + a and s' * A + a', [N] each, with rewards from the table [S, A]."""
+    s, a = np.divmod(pair, np.int32(reward.shape[1]))
+    s_next, a_next = np.divmod(pair_next, np.int32(reward.shape[1]))
+    return Transitions(s, a, reward.ravel()[pair], s_next, a_next)
 
 
 def _step_through(

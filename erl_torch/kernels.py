@@ -14,6 +14,9 @@ from pathlib import Path
 
 import numba
 import numpy as np
+from llvmlite import ir
+from numba.core import types
+from numba.extending import intrinsic
 
 
 def compiled_before() -> bool:
@@ -35,7 +38,21 @@ def visit_counts(pair, n_pairs):
     return counts
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def _forget(weight, scale, keep, first, last):
+    """One visit of a pair: what its row, scale * weight[first:last], holds is multiplied by ``keep``.
+
+    Returns the new scale; the weights change only once it leaves the range where nothing is lost.
+    """
+    scale *= keep
+    if scale < 1e-200:
+        for m in range(first, last):
+            weight[m] *= scale
+        scale = 1.0
+    return scale
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
 def psi_map(pair, s_next, counts, n_states, lr_psi):
     """W of one psi epoch as CSR [n_pairs, n_states]; the decay is (1 - lr_psi)**counts.
 
@@ -54,29 +71,37 @@ def psi_map(pair, s_next, counts, n_states, lr_psi):
     indptr = np.zeros(n_pairs + 1, np.int64)
     indices = np.empty(max(1, min(pair.size, n_pairs * n_states)), np.int32)
     data = np.empty(indices.size, np.float64)
-    weight_of = np.zeros(n_states, np.float64)
+    place = np.full(n_states, -1, np.int64)  # of a state in the row
+    row = np.empty(n_states, np.float64)
     n = 0
     for k in range(n_pairs):
-        weight = lr_psi
-        first = n
-        for v in range(end[k] - 1, end[k] - counts[k] - 1, -1):
-            if weight < 1e-300:  # older visits are below the last bit of the sum
-                break
+        used = 0
+        scale = 1.0
+        for v in range(end[k] - counts[k], end[k]):
             s = visits[v]
-            if weight_of[s] == 0.0:
-                indices[n] = s
-                n += 1
-            weight_of[s] += weight
-            weight *= 1.0 - lr_psi
-        indices[first:n].sort()
-        for m in range(first, n):
-            data[m] = weight_of[indices[m]]
-            weight_of[indices[m]] = 0.0
+            if place[s] < 0:
+                place[s] = used
+                row[used] = 0.0
+                indices[n + used] = s
+                used += 1
+            scale = _forget(row, scale, 1.0 - lr_psi, 0, used)
+            row[place[s]] += lr_psi / scale
+        indices[n : n + used].sort()
+        kept = n
+        for m in range(n, n + used):
+            s = indices[m]
+            weight = row[place[s]] * scale
+            place[s] = -1
+            if weight > 0.0:  # older visits underflow
+                indices[kept] = s
+                data[kept] = weight
+                kept += 1
+        n = kept
         indptr[k + 1] = n
     return indptr, indices[:n].copy(), data[:n].copy()
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy", nogil=True)
 def psi_phase(indptr, indices, data, decay, psi, log_psi, mean_psi, mean_log_psi, tolerance, epsilon, max_epochs):
     """Lines 2-3 until the relative change between epochs is below ``tolerance``; tables change in place.
 
@@ -111,17 +136,42 @@ def psi_phase(indptr, indices, data, decay, psi, log_psi, mean_psi, mean_log_psi
 # ---------------------------------------------------------------------------------------------------
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _u_chunk(pair, pair_next, factor, noisy, g, z, inv_rho, lr_u, lr_rho, inv_rho_min, new, begin, end):
-    """Tuples begin..end of lines 9-11. z changes in place; returns 1/rho.
+@intrinsic
+def _fma(typing, a, b, c):
+    """a * b + c with one rounding: written out, since what a compiler fuses by itself differs from loop to loop."""
+    signature = types.float64(types.float64, types.float64, types.float64)
 
-    With q = 1/rho and w = g * z(s',a'), line 10 is z' = (1-lr_u) z + lr_u w q, and line 11,
-    rho' = (1-lr_rho) rho + lr_rho w / z', becomes q' = q z' / ((1-lr_rho) z' + lr_rho w q). Written in
-    the old z, numerator and denominator are ready together: a chain of multiply-add, divide, multiply.
+    def generate(context, builder, signature, arguments):
+        return builder.fma(*arguments)
+
+    return signature, generate
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def _lines_10_and_11(gain, z, z_next, q, lr_u, lr_rho, inv_rho_min, same):
+    """(z, q = 1/rho) after a tuple of gain g(s,a).
+
+    With w = g * z(s',a'), line 10 is z' = (1-lr_u) z + lr_u w q, and line 11, rho' = (1-lr_rho) rho + lr_rho w / z',
+    becomes q' = q z' / ((1-lr_rho) z' + lr_rho w q). Written in the old z, numerator and denominator are ready
+    together: a chain of multiply-add, divide, multiply. ``same``: a self-loop read with the new u, so that
+    u(s',a')/u(s,a) = 1 in line 11.
     """
-    keep = 1.0 - lr_u
     keep_rho = 1.0 - lr_rho
-    both = keep_rho * lr_u + lr_rho
+    w = gain * z_next
+    kept = (1.0 - lr_u) * z
+    z_new = _fma(lr_u * w, q, kept)
+    # Selects, not branches.
+    den_kept = keep_rho if same else keep_rho * kept
+    den_w = lr_rho * gain if same else _fma(keep_rho, lr_u, lr_rho) * w
+    num = 1.0 if same else z_new
+    q_new = q * (num / _fma(den_w, q, den_kept))
+    # Not max(): NaN must stay visible.
+    return z_new, inv_rho_min if q_new < inv_rho_min else q_new
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def _u_chunk(pair, pair_next, factor, noisy, g, z, inv_rho, lr_u, lr_rho, inv_rho_min, new, begin, end):
+    """Tuples begin..end of lines 9-11. z changes in place; returns 1/rho."""
     q = inv_rho
     for t in range(begin, end):
         k = pair[t]
@@ -129,22 +179,11 @@ def _u_chunk(pair, pair_next, factor, noisy, g, z, inv_rho, lr_u, lr_rho, inv_rh
         gain = g[k]
         if noisy:
             gain *= factor[t]
-        w = gain * z[j]
-        kept = keep * z[k]
-        z_new = kept + (lr_u * w) * q
-        z[k] = z_new
-        # Self-loop read with the new u: u(s',a')/u(s,a) = 1 in line 11. Selects, not branches.
-        same = new and k == j
-        den_kept = keep_rho if same else keep_rho * kept
-        den_w = lr_rho * gain if same else both * w
-        num = 1.0 if same else z_new
-        q *= num / (den_kept + den_w * q)
-        if q < inv_rho_min:  # not max(): NaN must stay visible
-            q = inv_rho_min
+        z[k], q = _lines_10_and_11(gain, z[k], z[j], q, lr_u, lr_rho, inv_rho_min, new and k == j)
     return q
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy", nogil=True)
 def _is_healthy(z, q):
     if not (np.isfinite(q) and q > 0.0):
         return False
@@ -154,7 +193,7 @@ def _is_healthy(z, q):
     return True
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy", nogil=True)
 def u_epoch(pair, pair_next, factor, noisy, g, z, inv_rho, lr_u, lr_rho, inv_rho_min, new, rescale_every, begin, end):
     """Lines 9-11 over tuples begin..end; z [n_pairs] changes in place.
 
@@ -188,6 +227,110 @@ def u_epoch(pair, pair_next, factor, noisy, g, z, inv_rho, lr_u, lr_rho, inv_rho
                 for k in range(z.size):
                     z[k] *= scale
     return q, end
+
+
+# ---------------------------------------------------------------------------------------------------
+# The same for many replicas at once. A stream bounds its own learner by the latency of a division; side by side,
+# replicas fill the gaps. Lane i of a block holds z and g of pair k at [k * step_k + i * step_lane] of flat tables.
+# Every lane goes through the operations of `u_epoch`, in its order: the same bits, whatever the block.
+# ---------------------------------------------------------------------------------------------------
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def _lanes_rows(
+    pair, pair_next, factor, noisy, g, z, q, lr_u, lr_rho, inv_rho_min, new, step_k, step_lane, begin, end
+):  # fmt: skip
+    """Rows begin..end of streams [n, lanes], a stream a lane; z [n_pairs * lanes] and q [lanes] change in place."""
+    for t in range(begin, end):
+        for i in range(q.size):
+            k = pair[t, i] * step_k + i * step_lane
+            j = pair_next[t, i] * step_k + i * step_lane
+            gain = g[k]
+            if noisy:
+                gain *= factor[t, i]
+            z[k], q[i] = _lines_10_and_11(gain, z[k], z[j], q[i], lr_u[i], lr_rho[i], inv_rho_min[i], new and k == j)
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def _shared_rows(pair, pair_next, factor, noisy, g, z, q, lr_u, lr_rho, inv_rho_min, new, begin, end):
+    """Tuples begin..end of one stream [n] for all lanes; z, g [n_pairs * lanes], lanes side by side: no gather."""
+    lanes = q.size
+    for t in range(begin, end):
+        k = pair[t] * lanes
+        j = pair_next[t] * lanes
+        same = new and k == j
+        for i in range(lanes):
+            gain = g[k + i]
+            if noisy:
+                gain *= factor[t, i]
+            z[k + i], q[i] = _lines_10_and_11(gain, z[k + i], z[j + i], q[i], lr_u[i], lr_rho[i], inv_rho_min[i], same)
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def _settle(z, q, z_before, q_before, failed, step_k, step_lane, rescale, began):
+    """After a stretch that began at tuple ``began``: lanes that left the numbers go back, the others are rescaled.
+
+    ``failed`` [lanes] gets the stretch in which a lane first left, -1 before.
+    """
+    n_pairs = z.size // q.size
+    for i in range(q.size):
+        healthy = np.isfinite(q[i]) and q[i] > 0.0
+        total = 0.0
+        for n in range(n_pairs):
+            x = z[n * step_k + i * step_lane]
+            healthy = healthy and np.isfinite(x) and x > 0.0
+            total += x
+        if not healthy:
+            if failed[i] < 0:
+                failed[i] = began
+            q[i] = q_before[i]
+            for n in range(n_pairs):
+                k = n * step_k + i * step_lane
+                z[k] = z_before[k]
+        elif rescale:
+            _, exponent = math.frexp(total / n_pairs)
+            if exponent > 1 or exponent < 0:
+                scale = math.ldexp(1.0, -exponent)
+                for n in range(n_pairs):
+                    z[n * step_k + i * step_lane] *= scale
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def lanes_epoch(
+    pair, pair_next, factor, noisy, g, z, q, lr_u, lr_rho, inv_rho_min, new, step_k, step_lane, rescale_every, failed,
+    begin, end,
+):  # fmt: skip
+    """``u_epoch`` over tuples begin..end of streams [n, lanes]; factor [end - begin, lanes] where ``noisy``.
+
+    z, q and failed change in place (see ``_settle``).
+    """
+    t = begin
+    while t < end:
+        stop = min(end, t - t % rescale_every + rescale_every)
+        z_before, q_before = z.copy(), q.copy()
+        _lanes_rows(
+            pair[begin:], pair_next[begin:], factor, noisy, g, z, q, lr_u, lr_rho, inv_rho_min, new, step_k, step_lane,
+            t - begin, stop - begin,
+        )  # fmt: skip
+        _settle(z, q, z_before, q_before, failed, step_k, step_lane, stop % rescale_every == 0, t)
+        t = stop
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def shared_epoch(
+    pair, pair_next, factor, noisy, g, z, q, lr_u, lr_rho, inv_rho_min, new, rescale_every, failed, begin, end
+):
+    """``lanes_epoch`` over one stream [n] for all lanes, which lie side by side in z and g."""
+    t = begin
+    while t < end:
+        stop = min(end, t - t % rescale_every + rescale_every)
+        z_before, q_before = z.copy(), q.copy()
+        _shared_rows(
+            pair[begin:], pair_next[begin:], factor, noisy, g, z, q, lr_u, lr_rho, inv_rho_min, new, t - begin,
+            stop - begin,
+        )  # fmt: skip
+        _settle(z, q, z_before, q_before, failed, q.size, 1, stop % rescale_every == 0, t)
+        t = stop
 
 
 # ---------------------------------------------------------------------------------------------------
@@ -388,52 +531,153 @@ def _draw(cdf, low, high, x):
     return low
 
 
-@numba.njit(cache=True, error_model="numpy")
-def simulate(
-    indptr,
-    indices,
-    cdf,
-    reward,
-    start_cdf,
-    behaviour_cdf,
-    prior_cdf,
-    on_prior,
-    episode_length,
-    environment_rng,
-    behaviour_rng,
-    s_out,
-    a_out,
-    r_out,
-    s_next_out,
-    a_next_out,
-):
-    """Episodes of ``episode_length`` steps, written into the five columns (their length is the total).
+@intrinsic
+def _pcg64(typing, high, low, increment_high, increment_low):
+    """One step of PCG64 (XSL-RR), NumPy's default generator: (state high, state low, word), all uint64."""
+    word = types.uint64
+    signature = types.UniTuple(word, 3)(word, word, word, word)
 
-    ``reward`` [S, A]; the cdfs of the policies are flat [S*A]. With ``on_prior`` the behaviour policy is
-    the prior and the action taken next is a'; otherwise a' is a draw of its own.
+    def generate(context, builder, signature, arguments):
+        wide, narrow = ir.IntType(128), ir.IntType(64)
+
+        def joined(high, low):
+            high, low = builder.zext(high, wide), builder.zext(low, wide)
+            return builder.or_(builder.shl(high, ir.Constant(wide, 64)), low)
+
+        multiplier = ir.Constant(wide, 0x2360ED051FC65DA44385DF649FCCF645)
+        state = builder.add(builder.mul(joined(*arguments[:2]), multiplier), joined(*arguments[2:]))
+        high, low = builder.trunc(builder.lshr(state, ir.Constant(wide, 64)), narrow), builder.trunc(state, narrow)
+        mixed, turn = builder.xor(high, low), builder.lshr(high, ir.Constant(narrow, 58))
+        back = builder.and_(builder.sub(ir.Constant(narrow, 0), turn), ir.Constant(narrow, 63))
+        word = builder.or_(builder.lshr(mixed, turn), builder.shl(mixed, back))
+        return context.make_tuple(builder, signature.return_type, [high, low, word])
+
+    return signature, generate
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def _uniforms(state, out, n):
+    """out[:n, i] gets what ``Generator(PCG64).random(n)`` gives; state [4, lanes] uint64 (see ``_pcg64``) moves on."""
+    for t in range(n):
+        for i in range(state.shape[1]):
+            high, low, word = _pcg64(state[0, i], state[1, i], state[2, i], state[3, i])
+            state[0, i] = high
+            state[1, i] = low
+            out[t, i] = np.float64(np.int64(word >> np.uint64(11))) * (1.0 / 9007199254740992.0)
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def _draw_lanes(cdf, low, length, levels, x):
+    """``_draw`` in the rows low..low+length of every lane, without branches; low becomes the index drawn.
+
+    ``levels`` halvings, enough for the longest row; length [lanes] is used up.
     """
-    n_actions = reward.shape[1]
-    s = 0
-    a = 0
-    for t in range(s_out.size):
-        if t % episode_length == 0:
-            s = _draw(start_cdf, 0, start_cdf.size, environment_rng.random())
-            a = _draw(behaviour_cdf, s * n_actions, (s + 1) * n_actions, behaviour_rng.random())
-            a -= s * n_actions
-        k = s * n_actions + a
-        s_next = indices[_draw(cdf, indptr[k], indptr[k + 1], environment_rng.random())]
-        first = s_next * n_actions
-        a_next = _draw(prior_cdf, first, first + n_actions, behaviour_rng.random()) - first
-        s_out[t] = s
-        a_out[t] = a
-        r_out[t] = reward[s, a]
-        s_next_out[t] = s_next
-        a_next_out[t] = a_next
-        s = s_next
+    if low.size < 4:  # too few to hide the latency of so many steps
+        for i in range(low.size):
+            low[i] = _draw(cdf, low[i], low[i] + length[i], x[i])
+        return
+    for _ in range(levels):
+        for i in range(low.size):
+            half = length[i] >> 1
+            # A select. Where half is 0 nothing is added, whatever is read (at index -1, the last).
+            low[i] += half if cdf[low[i] + half - 1] <= x[i] else 0
+            length[i] -= half
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def sample_rows(
+    indptr, indices, cdf, levels, start_cdf, behaviour_cdf, prior_cdf, on_prior, n_actions, action_levels,
+    episode_length, environment, behaviour, now, done, pair, entry, pair_next,
+):  # fmt: skip
+    """The next tuples of every lane's stream, written into pair, entry and pair_next [n, lanes].
+
+    ``entry`` is the index in the CSR transition matrix (s' = indices[entry]); pair_next is s' * A + a'. With
+    ``on_prior`` the behaviour policy is the prior and the action taken next is a'; otherwise a' is a draw of its own.
+    ``environment`` and ``behaviour`` [4, lanes] are the generators of each lane, ``now`` [lanes] the pairs that come
+    next, ``done`` the tuples that each stream has had; all but the last move on in place.
+    """
+    n, lanes = pair.shape
+    restarts = (done + n + episode_length - 1) // episode_length - (done + episode_length - 1) // episode_length
+    acts = 1 if on_prior else 2
+    x = np.empty((n + restarts, lanes))
+    y = np.empty((acts * n + restarts, lanes))
+    _uniforms(environment, x, len(x))
+    _uniforms(behaviour, y, len(y))
+    low = np.empty(lanes, np.int64)
+    length = np.empty(lanes, np.int64)
+    x_row = 0
+    y_row = 0
+    for t in range(n):
+        if (done + t) % episode_length == 0:
+            for i in range(lanes):
+                s = _draw(start_cdf, 0, start_cdf.size, x[x_row, i])
+                now[i] = _draw(behaviour_cdf, s * n_actions, (s + 1) * n_actions, y[y_row, i])
+            x_row += 1
+            y_row += 1
+        for i in range(lanes):
+            k = now[i]
+            pair[t, i] = k
+            low[i] = indptr[k]
+            length[i] = indptr[k + 1] - indptr[k]
+        _draw_lanes(cdf, low, length, levels, x[x_row])
+        x_row += 1
+        for i in range(lanes):
+            entry[t, i] = low[i]
+            low[i] = indices[low[i]] * n_actions
+            length[i] = n_actions
+        if not on_prior:
+            now[:] = low
+        _draw_lanes(prior_cdf, low, length, action_levels, y[y_row])
+        y_row += 1
+        for i in range(lanes):
+            pair_next[t, i] = low[i]
         if on_prior:
-            a = a_next
+            now[:] = low
         else:
-            a = _draw(behaviour_cdf, first, first + n_actions, behaviour_rng.random()) - first
+            length[:] = n_actions
+            _draw_lanes(behaviour_cdf, now, length, action_levels, y[y_row])
+            y_row += 1
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def sampled_epoch(
+    tables, environment, behaviour, now, buffers, g, z, q, lr_u, lr_rho, inv_rho_min, new, step_k, step_lane,
+    rescale_every, failed, begin, end,
+):  # fmt: skip
+    """``lanes_epoch`` over streams that are sampled as they are used: no tuple is kept.
+
+    ``tables``: the arguments of ``sample_rows`` that are the same for all lanes; ``buffers``: three arrays
+    [rows, lanes] int32 for its results.
+    """
+    t = begin
+    factor = np.empty((1, 1))
+    while t < end:
+        stop = min(end, t - t % rescale_every + rescale_every)
+        z_before, q_before = z.copy(), q.copy()
+        for first in range(t, stop, len(buffers[0])):
+            n = min(len(buffers[0]), stop - first)
+            pair, entry, pair_next = buffers[0][:n], buffers[1][:n], buffers[2][:n]
+            sample_rows(*tables, environment, behaviour, now, first, pair, entry, pair_next)
+            _lanes_rows(
+                pair, pair_next, factor, False, g, z, q, lr_u, lr_rho, inv_rho_min, new, step_k, step_lane, 0, n
+            )
+        _settle(z, q, z_before, q_before, failed, step_k, step_lane, stop % rescale_every == 0, t)
+        t = stop
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def survey(indptr, pair, entry, keep_psi, lr_psi, visits, weight, scale):
+    """Visits and W (see ``psi_map``) of streams [n, lanes], on the rows of the model's CSR transition matrix.
+
+    visits [lanes, n_pairs] counts on; W = scale [lanes, n_pairs] * weight [lanes, nnz].
+    """
+    n, lanes = pair.shape
+    for t in range(n):
+        for i in range(lanes):
+            k = pair[t, i]
+            visits[i, k] += 1
+            scale[i, k] = _forget(weight[i], scale[i, k], keep_psi[i], indptr[k], indptr[k + 1])
+            weight[i, entry[t, i]] += lr_psi[i] / scale[i, k]
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -16,9 +16,9 @@ import torch
 from erl_torch import checks
 from erl_torch.envs.control import REWARDS, ControlTask, control_task
 from erl_torch.envs.discretise import UniformBins
-from erl_torch.experience import policy_cdf
 from erl_torch.mdp import check_policy
 from erl_torch.rng import Streams, streams
+from erl_torch.sampling import policy_cdf
 from erl_torch.transitions import Transitions
 
 

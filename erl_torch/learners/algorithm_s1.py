@@ -120,7 +120,7 @@ class S1State:
             "rho": self.rho,
             "theta": self.theta,
             "delta_max": self.reward_bias_max,
-            "delta_mean": float(self.reward_bias.mean()),
+            "delta_mean": float(self.reward_bias.cpu().numpy().mean()),
             "psi_error": self.psi_error,
             "psi_epochs": self.psi_epochs,
             "bias_iteration": self.bias_iteration,
@@ -298,10 +298,7 @@ class AlgorithmS1:
         reward = np.zeros(n_pairs)
         reward[pair] = transitions.r
         noisy = bool((reward[pair] != transitions.r).any())
-        largest = self.beta * float(transitions.r.max())
-        if largest > 700:
-            raise NonFiniteError(0, f"exp(beta r) overflows at beta*max(r) = {largest:.6g}: lower beta or shift r")
-        rho_max = max(1.0, math.exp(largest)) if self.clip_rho else math.inf
+        rho_max = self.largest_rho(float(transitions.r.max()))
         return S1Stream(
             data=transitions,
             visited=(counts > 0).reshape(n_states, n_actions),
@@ -330,16 +327,20 @@ class AlgorithmS1:
             n_tuples = state.n_tuples + len(stream.data)
             if done < len(stream.data):
                 raise self._failure(state, stream, done)
-            if self.unvisited == "prior":
-                u = _fill_with_prior(u, state.prior_policy, torch.from_numpy(stream.visited).to(u.device))
-            u = u / u.mean()
-            psi = 1 / (state.prior_policy * u).sum(1)  # line 12
-            after = replace(state, epoch=state.epoch + 1, n_tuples=n_tuples, rho=rho, u=u, psi=psi)
-            if not (_positive(u) and _positive(psi) and _positive((state.prior_policy * u).sum(1))):
+            visited = stream.visited if self.unvisited == "prior" else None
+            u, psi = line_12(u, state.prior_policy.cpu().numpy(), visited)
+            if not (positive(u).all() and positive(psi).all()):
                 raise NonFiniteError(
                     n_tuples, f"u spans more than double precision holds at beta={self.beta:g}: lower beta"
                 )
-        return after
+            return replace(
+                state,
+                epoch=state.epoch + 1,
+                n_tuples=n_tuples,
+                rho=rho,
+                u=torch.from_numpy(u).to(self.device),
+                psi=torch.from_numpy(psi).to(self.device),
+            )
 
     # -- lines --------------------------------------------------------------------------------------
 
@@ -347,10 +348,8 @@ class AlgorithmS1:
         """Lines 2-8."""
         run = self._psi_phase_fast if self.implementation == "fast" else self._psi_phase_literal
         mean_psi, mean_log_psi, epochs, error = run(state, stream)
-        reward_bias = (mean_psi.log() - mean_log_psi) / self.beta  # line 5
-        # <psi> >= exp(<log psi>) by Jensen; the two running means keep that up to rounding.
-        reward_bias = reward_bias.clamp(min=0.0)
-        if not (_positive(mean_psi) and torch.isfinite(reward_bias).all()):
+        bias = reward_biases(mean_psi, mean_log_psi, self.beta)
+        if not (positive(mean_psi).all() and np.isfinite(bias).all()):
             raise NonFiniteError(
                 state.n_tuples,
                 f"psi spans more than double precision holds in biasing iteration {state.bias_iteration} "
@@ -360,9 +359,9 @@ class AlgorithmS1:
         return replace(
             state,
             psi_in_use=state.psi,
-            mean_psi=mean_psi,
-            mean_log_psi=mean_log_psi,
-            reward_bias=reward_bias,
+            mean_psi=torch.from_numpy(mean_psi).to(self.device),
+            mean_log_psi=torch.from_numpy(mean_log_psi).to(self.device),
+            reward_bias=torch.from_numpy(bias).to(self.device),
             psi_epochs=epochs,
             psi_error=error,
             psi_converged=state.psi_converged and error < self.psi_tol,
@@ -370,23 +369,39 @@ class AlgorithmS1:
             rho=math.exp(-self.beta) if reset else state.rho,  # line 8
         )
 
-    def _psi_phase_fast(self, state: S1State, stream: S1Stream) -> tuple[torch.Tensor, torch.Tensor, int, float]:
-        mean_psi, mean_log_psi = state.mean_psi.cpu().clone(), state.mean_log_psi.cpu().clone()
-        psi = state.psi.cpu().numpy()
+    def _psi_phase_fast(self, state: S1State, stream: S1Stream) -> tuple[np.ndarray, np.ndarray, int, float]:
+        mean_psi, mean_log_psi = state.mean_psi.cpu().numpy().copy(), state.mean_log_psi.cpu().numpy().copy()
+        epochs, error = self.psi_phase(
+            stream.psi_map, stream.decay, state.psi.cpu().numpy(), mean_psi.reshape(-1), mean_log_psi.reshape(-1)
+        )
+        return mean_psi, mean_log_psi, epochs, error
+
+    def psi_phase(
+        self,
+        psi_map: tuple[np.ndarray, np.ndarray, np.ndarray],
+        decay: np.ndarray,
+        psi: np.ndarray,
+        mean_psi: np.ndarray,
+        mean_log_psi: np.ndarray,
+    ) -> tuple[int, float]:
+        """Lines 2-3 from W and decay [S*A] of a stream and psi [S]; the means [S*A] change in place.
+
+        Returns (epochs, relative error at the end).
+        """
         epochs, error = kernels.psi_phase(
-            *stream.psi_map,
-            stream.decay,
+            *psi_map,
+            decay,
             psi,
             np.log(psi),
-            mean_psi.view(-1).numpy(),
-            mean_log_psi.view(-1).numpy(),
+            mean_psi,
+            mean_log_psi,
             self.psi_tol,
             LOG_PSI_EPSILON,
             self.max_psi_epochs,
         )
-        return mean_psi.to(self.device), mean_log_psi.to(self.device), epochs, error
+        return int(epochs), float(error)
 
-    def _psi_phase_literal(self, state: S1State, stream: S1Stream) -> tuple[torch.Tensor, torch.Tensor, int, float]:
+    def _psi_phase_literal(self, state: S1State, stream: S1Stream) -> tuple[np.ndarray, np.ndarray, int, float]:
         mean_psi, mean_log_psi = state.mean_psi.clone(), state.mean_log_psi.clone()
         psi = state.psi
         error = math.inf
@@ -406,16 +421,21 @@ class AlgorithmS1:
                 float(((mean_psi - before).abs() / before).max()),
                 float(((mean_log_psi - log_before).abs() / (log_before.abs() + LOG_PSI_EPSILON)).max()),
             )
-        return mean_psi, mean_log_psi, epochs, error
+        return mean_psi.cpu().numpy(), mean_log_psi.cpu().numpy(), epochs, error
 
-    def _u_epoch_fast(self, state: S1State, stream: S1Stream) -> tuple[torch.Tensor, float, int]:
+    def _u_epoch_fast(self, state: S1State, stream: S1Stream) -> tuple[np.ndarray, float, int]:
         n_states, n_actions = state.u.shape
-        psi = state.psi_in_use.cpu()
-        z = state.u.cpu() * psi[:, None]
-        log_g = self.beta * (stream.reward - state.reward_bias_max) - state.mean_log_psi.cpu().view(-1).numpy()
-        g = np.exp(log_g + np.repeat(np.log(psi.numpy()), n_actions))
-        table = z.view(-1).numpy()  # zero-copy: the kernel writes into z
-        rescale_every = self.rescale_every or max(5000, n_states * n_actions)
+        psi = state.psi_in_use.cpu().numpy()
+        g = gains(
+            stream.reward.reshape(n_states, n_actions),
+            state.reward_bias.cpu().numpy(),
+            state.mean_log_psi.cpu().numpy(),
+            psi,
+            self.beta,
+        )
+        z = state.u.cpu().numpy() * psi[:, None]
+        g, table = g.reshape(-1), z.reshape(-1)  # views: the kernel writes into z
+        rescale_every = self.rescale(n_states * n_actions)
         inv_rho = 1 / state.rho
         t = 0
         while t < len(stream.data):
@@ -429,7 +449,7 @@ class AlgorithmS1:
                 table,
                 inv_rho,
                 self.lr_u,
-                self._lr_rho(n_states),
+                self.rate_of_rho(n_states),
                 1 / stream.rho_max,
                 self.self_loop == "new",
                 rescale_every,
@@ -439,9 +459,9 @@ class AlgorithmS1:
             if t < stop:
                 break
         rho = 1 / inv_rho if inv_rho else math.inf
-        return (z / psi[:, None]).to(self.device), rho, t
+        return z / psi[:, None], rho, t
 
-    def _u_epoch_literal(self, state: S1State, stream: S1Stream) -> tuple[torch.Tensor, float, int]:
+    def _u_epoch_literal(self, state: S1State, stream: S1Stream) -> tuple[np.ndarray, float, int]:
         u = state.u.clone()
         rho, t = listing.u_epoch(
             stream.data,
@@ -453,15 +473,27 @@ class AlgorithmS1:
             state.rho,
             beta=self.beta,
             lr_u=self.lr_u,
-            lr_rho=self._lr_rho(len(u)),
+            lr_rho=self.rate_of_rho(len(u)),
             rho_max=stream.rho_max,
             self_loop=self.self_loop,
-            rescale_every=self.rescale_every or max(5000, u.numel()),
+            rescale_every=self.rescale(u.numel()),
         )
-        return u, rho, t
+        return u.cpu().numpy(), rho, t
 
-    def _lr_rho(self, n_states: int) -> float:
+    def rate_of_rho(self, n_states: int) -> float:
+        """Step size of line 11."""
         return self.lr_u / n_states if self.lr_rho is None else self.lr_rho
+
+    def rescale(self, n_pairs: int) -> int:
+        """Tuples between rescalings of u."""
+        return self.rescale_every or max(5000, n_pairs)
+
+    def largest_rho(self, largest_reward: float) -> float:
+        """The bound of ``clip_rho``. Raises NonFiniteError where exp(beta r) overflows."""
+        exponent = self.beta * largest_reward
+        if exponent > 700:
+            raise NonFiniteError(0, f"exp(beta r) overflows at beta*max(r) = {exponent:.6g}: lower beta or shift r")
+        return max(1.0, math.exp(exponent)) if self.clip_rho else math.inf
 
     def _failure(self, state: S1State, stream: S1Stream, t: int) -> NonFiniteError:
         data = stream.data
@@ -477,13 +509,37 @@ def _walkable(table: torch.Tensor) -> torch.Tensor | np.ndarray:
     return table.numpy() if table.device.type == "cpu" else table
 
 
-def _positive(table: torch.Tensor) -> bool:
-    return bool((torch.isfinite(table) & (table > 0)).all())
+# -- lines between the streams, for one replica or with a leading axis of several: the same bits ------
 
 
-def _fill_with_prior(u: torch.Tensor, prior: torch.Tensor, visited: torch.Tensor) -> torch.Tensor:
-    """u where visited; elsewhere the state's mean over its visited actions, or 1 if it has none."""
-    weight = prior * visited
-    mass = weight.sum(1, keepdim=True)
-    mean = torch.where(mass > 0, (weight * u).sum(1, keepdim=True) / mass, torch.ones_like(mass))
-    return torch.where(visited, u, mean)
+def positive(table: np.ndarray) -> np.ndarray:
+    """Where ``table`` is a positive finite number."""
+    return np.isfinite(table) & (table > 0)  # type: ignore[no-any-return]
+
+
+def reward_biases(mean_psi: np.ndarray, mean_log_psi: np.ndarray, beta: float | np.ndarray) -> np.ndarray:
+    """delta [..., S, A] of line 5, reward; beta a number, or an array that broadcasts."""
+    # <psi> >= exp(<log psi>) by Jensen; the two running means keep that up to rounding.
+    return np.maximum((np.log(mean_psi) - mean_log_psi) / beta, 0.0)  # type: ignore[no-any-return]
+
+
+def gains(
+    reward: np.ndarray, reward_bias: np.ndarray, mean_log_psi: np.ndarray, psi: np.ndarray, beta: float | np.ndarray
+) -> np.ndarray:
+    """g [..., S, A] of the gauge z = psi u; psi [..., S] is the one behind the biases."""
+    largest = reward_bias.max((-2, -1), keepdims=True)  # line 6
+    return np.exp(beta * (reward - largest) - mean_log_psi + np.log(psi)[..., None])  # type: ignore[no-any-return]
+
+
+def line_12(u: np.ndarray, prior: np.ndarray, visited: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    """(u of mean 1 [..., S, A], psi [..., S]).
+
+    ``visited`` [..., S, A]: pairs outside get the mean of u over their state's visited actions, or 1 if it has none.
+    """
+    if visited is not None:
+        weight = prior * visited
+        mass = weight.sum(-1, keepdims=True)
+        mean = np.where(mass > 0, (weight * u).sum(-1, keepdims=True) / mass, 1.0)
+        u = np.where(visited, u, mean)
+    u = u / u.reshape(*u.shape[:-2], -1).mean(-1)[..., None, None]
+    return u, 1 / (prior * u).sum(-1)
