@@ -15,7 +15,6 @@ from pathlib import Path
 import numba
 import numpy as np
 from llvmlite import ir
-from numba.core import types
 from numba.extending import intrinsic
 
 
@@ -139,7 +138,7 @@ def psi_phase(indptr, indices, data, decay, psi, log_psi, mean_psi, mean_log_psi
 @intrinsic
 def _fma(typing, a, b, c):
     """a * b + c with one rounding: written out, since what a compiler fuses by itself differs from loop to loop."""
-    signature = types.float64(types.float64, types.float64, types.float64)
+    signature = numba.float64(numba.float64, numba.float64, numba.float64)
 
     def generate(context, builder, signature, arguments):
         return builder.fma(*arguments)
@@ -534,8 +533,8 @@ def _draw(cdf, low, high, x):
 @intrinsic
 def _pcg64(typing, high, low, increment_high, increment_low):
     """One step of PCG64 (XSL-RR), NumPy's default generator: (state high, state low, word), all uint64."""
-    word = types.uint64
-    signature = types.UniTuple(word, 3)(word, word, word, word)
+    word = numba.uint64
+    signature = numba.types.UniTuple(word, 3)(word, word, word, word)
 
     def generate(context, builder, signature, arguments):
         wide, narrow = ir.IntType(128), ir.IntType(64)

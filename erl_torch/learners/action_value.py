@@ -39,7 +39,7 @@ import torch
 
 from erl_torch import checks, kernels
 from erl_torch.checks import InputError
-from erl_torch.learners.fitting import NonFiniteError, run_to_end
+from erl_torch.learners.fitting import NonFiniteError, epochs, run_to_end
 from erl_torch.mdp import check_policy
 from erl_torch.solution import Solution, Status
 from erl_torch.transitions import Transitions
@@ -137,11 +137,11 @@ class ActionValueLearner:
 
     def iterate(self, transitions: Transitions, n_states: int, n_actions: int) -> Iterator[ActionValueState]:
         """Yield the state after each pass, n_epochs times. Raises NonFiniteError."""
-        stream = self.prepare(transitions, n_states, n_actions)
-        state = self.init(n_states, n_actions)
-        for _ in range(self.n_epochs):
-            state = self.step(state, stream)
-            yield state
+        yield from epochs(self, transitions, n_states, n_actions)
+
+    def finished(self, state: ActionValueState) -> bool:
+        """After the last pass."""
+        return state.epoch == self.n_epochs
 
     def solution(
         self,
@@ -150,7 +150,7 @@ class ActionValueLearner:
         failure: NonFiniteError | None = None,
     ) -> Solution:
         """The solution that ``state`` stands for; ``history`` holds one ``metrics()`` a pass."""
-        ended = Status.COMPLETED if state.epoch == self.n_epochs else Status.STOPPED
+        ended = Status.COMPLETED if self.finished(state) else Status.STOPPED
         rows = history or []
         return Solution.of_action_values(
             state.action_value,

@@ -69,7 +69,7 @@ import torch
 from erl_torch import checks, kernels
 from erl_torch.checks import InputError
 from erl_torch.learners import listing
-from erl_torch.learners.fitting import NonFiniteError, run_to_end
+from erl_torch.learners.fitting import NonFiniteError, epochs, run_to_end
 from erl_torch.mdp import check_policy
 from erl_torch.solution import Solution, Status
 from erl_torch.transitions import Transitions
@@ -223,11 +223,11 @@ class AlgorithmS1:
         The caller may log it, save it, or stop. Raises NonFiniteError with step and cause; the state
         yielded last is then still good.
         """
-        stream = self.prepare(transitions, n_states, n_actions)
-        state = self.init(n_states, n_actions)
-        for _ in range(self.n_bias * self.n_epochs):
-            state = self.step(state, stream)
-            yield state
+        yield from epochs(self, transitions, n_states, n_actions)
+
+    def finished(self, state: S1State) -> bool:
+        """After the last epoch of the last biasing iteration."""
+        return (state.bias_iteration, state.epoch) == (self.n_bias - 1, self.n_epochs)
 
     def solution(
         self,
@@ -238,7 +238,7 @@ class AlgorithmS1:
         """The solution that ``state`` stands for; ``history`` holds one ``metrics()`` an epoch."""
         if failure is not None:
             status = Status.NON_FINITE
-        elif (state.bias_iteration, state.epoch) != (self.n_bias - 1, self.n_epochs):
+        elif not self.finished(state):
             status = Status.STOPPED
         else:
             status = Status.COMPLETED if state.psi_converged else Status.PSI_LIMIT

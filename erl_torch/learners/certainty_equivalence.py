@@ -18,6 +18,7 @@ import torch
 
 from erl_torch import checks
 from erl_torch.empirical import EmpiricalMDP, EmpiricalProblem, empirical_mdp
+from erl_torch.learners.fitting import epochs
 from erl_torch.mdp import check_policy
 from erl_torch.solution import Solution, Status
 from erl_torch.solvers.soft_bellman import solve_problem
@@ -97,7 +98,11 @@ class CertaintyEquivalence:
 
     def iterate(self, transitions: Transitions, n_states: int, n_actions: int) -> Iterator[CertaintyEquivalenceState]:
         """Yield the one state."""
-        yield self.step(self.init(n_states, n_actions), self.prepare(transitions, n_states, n_actions))
+        yield from epochs(self, transitions, n_states, n_actions)
+
+    def finished(self, state: CertaintyEquivalenceState) -> bool:
+        """Once solved."""
+        return state.answer is not None
 
     def init(self, n_states: int, n_actions: int) -> CertaintyEquivalenceState:
         """The prior policy, before any tuple."""

@@ -71,7 +71,7 @@ from erl_torch.checks import InputError
 from erl_torch.empirical import EmpiricalMDP, EmpiricalProblem, empirical_mdp
 from erl_torch.evaluation import kl_per_state
 from erl_torch.learners.algorithm_s1 import BLOCK, LOG_PSI_EPSILON
-from erl_torch.learners.fitting import NonFiniteError, run_to_end
+from erl_torch.learners.fitting import NonFiniteError, epochs, run_to_end
 from erl_torch.mdp import check_policy
 from erl_torch.solution import Solution, Status
 from erl_torch.solvers.problem import soft_backup
@@ -261,13 +261,11 @@ class EfficientS1:
 
     def iterate(self, transitions: Transitions, n_states: int, n_actions: int) -> Iterator[EfficientState]:
         """Yield the state after each epoch: n_bias * n_epochs times, or until certified."""
-        stream = self.prepare(transitions, n_states, n_actions)
-        state = self.init(n_states, n_actions)
-        for _ in range(self.n_bias * self.n_epochs):
-            state = self.step(state, stream)
-            yield state
-            if state.certified:
-                return
+        yield from epochs(self, transitions, n_states, n_actions)
+
+    def finished(self, state: EfficientState) -> bool:
+        """Certified, or after the last epoch of the last biasing iteration."""
+        return state.certified or (state.bias_iteration, state.epoch) == (self.n_bias - 1, self.n_epochs)
 
     def solution(
         self,
@@ -280,7 +278,7 @@ class EfficientS1:
             status = Status.NON_FINITE
         elif state.certified:
             status = Status.CONVERGED
-        elif (state.bias_iteration, state.epoch) != (self.n_bias - 1, self.n_epochs):
+        elif not self.finished(state):
             status = Status.STOPPED
         else:
             status = Status.COMPLETED if state.psi_converged else Status.PSI_LIMIT

@@ -1,7 +1,8 @@
-"""What ``fit`` is for every learner that streams: all of ``iterate``, and its record."""
+"""What ``iterate`` and ``fit`` are for every learner that streams: steps until it is finished, and their record."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 from erl_torch.solution import Solution
@@ -17,6 +18,15 @@ class NonFiniteError(ArithmeticError):
 
     def __str__(self) -> str:
         return f"step {self.step}: {self.cause}"
+
+
+def epochs(learner: Any, transitions: Transitions, n_states: int, n_actions: int) -> Iterator[Any]:
+    """The states of ``learner`` after each epoch, until it is finished. Raises what its ``step`` raises."""
+    stream = learner.prepare(transitions, n_states, n_actions)
+    state = learner.init(n_states, n_actions)
+    while not learner.finished(state):
+        state = learner.step(state, stream)
+        yield state
 
 
 def run_to_end(learner: Any, transitions: Transitions, n_states: int, n_actions: int) -> Solution:

@@ -1,0 +1,326 @@
+r"""Many learners of one kind at once: seeds, and temperatures and step sizes side by side.
+
+    replicas = Replicas.of(AlgorithmS1(), n_replicas=200)
+    replicas = Replicas.of(AlgorithmS1(), beta=[2.0, 5.0, 10.0], lr_u=[0.005, 0.005, 0.01])
+
+Each replica is one of ``learners``, and comes out as if it had run alone, bit for bit, whatever the number of threads
+and the size of the blocks. Where the experience comes from:
+
+    Transitions              one stream that all replicas learn from
+    [Transitions, ...]       a recorded stream each
+    Simulation(mdp, seeds)   a stream each, of its seed: the tuples that ``collect`` gives for it. They are kept where
+                             they fit (``keep``), else sampled again in every pass, in memory that does not grow.
+
+Published Algorithm S1 runs with its replicas interleaved in one compiled loop (``erl_torch.learners.s1_lanes``), or in
+torch operations on a device (``erl_torch.learners.s1_torch``); all other learners a replica a thread.
+
+A replica that leaves the finite numbers stays at its last good epoch, named in ``failures``; the others go on.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+
+from erl_torch import checks
+from erl_torch.checks import InputError
+from erl_torch.experience import collect
+from erl_torch.learners.algorithm_s1 import AlgorithmS1
+from erl_torch.learners.fitting import NonFiniteError
+from erl_torch.mdp import TabularMDP, check_policy
+from erl_torch.solution import Solution
+from erl_torch.transitions import Transitions
+
+KEEP_BYTES = 1 << 30  # of tuples kept by default
+TUPLE_BYTES = 8  # a tuple in the interleaved loop
+PREPARED_BYTES = 40  # a tuple in the streams of all other learners, with the Transitions behind it
+
+
+@dataclass(frozen=True, eq=False)
+class Simulation:
+    """A stream of ``mdp`` for each seed: ``n_episodes`` of ``episode_length`` steps, a' from the learners' prior.
+
+    Args:
+        seeds: whole numbers >= 0, one a replica.
+        behaviour_policy: [S, A]; None is the prior.
+        keep: hold the tuples in memory (true), sample them again in every pass (false), or what fits 1 GiB (None).
+
+    Raises:
+        InputError: an argument out of its range.
+    """
+
+    mdp: TabularMDP
+    n_episodes: int
+    episode_length: int
+    seeds: Sequence[int]
+    behaviour_policy: Any = None
+    keep: bool | None = None
+
+    def __post_init__(self) -> None:
+        checks.at_least("n_episodes", self.n_episodes, 1)
+        checks.at_least("episode_length", self.episode_length, 1)
+        for seed in self.seeds:
+            checks.at_least("seeds", seed, 0)
+
+    @property
+    def n_tuples(self) -> int:
+        """Of each stream."""
+        return self.n_episodes * self.episode_length
+
+    def stream(self, replica: int, prior_policy: Any) -> Transitions:
+        """The tuples of one replica."""
+        seed = int(self.seeds[replica])
+        return collect(self.mdp, self.n_episodes, self.episode_length, seed, self.behaviour_policy, prior_policy)
+
+
+Experience = Transitions | Sequence[Transitions] | Simulation
+
+
+class ReplicaState(Protocol):
+    """What all replicas know after an epoch: a value, never changed in place."""
+
+    @property
+    def n_tuples(self) -> int:
+        """Tuples that each replica has streamed so far, those that stopped early excepted."""
+
+    @property
+    def failures(self) -> Mapping[int, NonFiniteError]:
+        """Replicas that left the finite numbers, at their last good epoch since."""
+
+    @property
+    def policy(self) -> torch.Tensor:
+        """[R, S, A]."""
+
+    def replica(self, r: int) -> Any:
+        """The state of one replica, as its own learner would have it."""
+
+    def metrics(self) -> dict[str, np.ndarray]:
+        """``metrics()`` of every replica, [R] each."""
+
+
+@dataclass(frozen=True, eq=False)
+class ReplicaSolution:
+    """The solutions of all replicas: tables with a leading axis [R]; ``[r]`` is the Solution of one."""
+
+    solutions: tuple[Solution, ...]
+    failures: Mapping[int, NonFiniteError] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.solutions)
+
+    def __getitem__(self, r: int) -> Solution:
+        return self.solutions[r]
+
+    def __getattr__(self, name: str) -> Any:
+        if name not in {f.name for f in fields(Solution)}:
+            raise AttributeError(name)
+        values = [getattr(solution, name) for solution in self.solutions]
+        if isinstance(values[0], torch.Tensor):
+            return torch.stack(values)
+        if isinstance(values[0], float):
+            return torch.tensor(values, dtype=torch.float64)
+        return values
+
+
+@dataclass(frozen=True, eq=False)
+class Replicas:
+    """Learners of one kind that run together; see the module's docstring.
+
+    Args:
+        learners: one a replica, of one class and with one prior policy.
+        threads: at work at once; None is one a core. No result depends on it.
+        block: replicas interleaved in one loop; None suits the size of the tables. No result depends on it.
+        layout: "lanes" (the replicas of a pair side by side), "tables" (each replica's table in one piece), or "auto".
+        backend: of Algorithm S1: "compiled", "torch", or "auto": torch where the learners' device is not the CPU.
+
+    Raises:
+        InputError: an argument out of its range.
+    """
+
+    learners: tuple[Any, ...]
+    threads: int | None = None
+    block: int | None = None
+    layout: str = "auto"
+    backend: str = "auto"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "learners", tuple(self.learners))
+        checks.at_least("n_replicas", len(self.learners), 1)
+        for learner in self.learners:
+            if type(learner) is not type(self.learners[0]):
+                raise InputError("learners", type(learner).__name__, f"all {type(self.learners[0]).__name__}")
+        for name in ("threads", "block"):
+            if getattr(self, name) is not None:
+                checks.at_least(name, getattr(self, name), 1)
+        checks.one_of("layout", self.layout, ("auto", "lanes", "tables"))
+        checks.one_of("backend", self.backend, ("auto", "compiled", "torch"))
+        if self.backend == "torch" and not isinstance(self.learners[0], AlgorithmS1):
+            raise InputError("backend", "torch", "compiled or auto: only AlgorithmS1 has torch operations")
+
+    @classmethod
+    def of(
+        cls,
+        learner: Any,
+        n_replicas: int | None = None,
+        *,
+        threads: int | None = None,
+        block: int | None = None,
+        layout: str = "auto",
+        backend: str = "auto",
+        **vectors: Iterable[float],
+    ) -> Replicas:
+        """``learner`` times ``n_replicas``; ``vectors`` give some of its arguments a value a replica, [R]."""
+        names = {f.name for f in fields(learner)}
+        columns = {name: list(values) for name, values in vectors.items()}
+        for name, column in columns.items():
+            if name not in names:
+                raise InputError(name, column, f"left out: the arguments of the learner are {', '.join(sorted(names))}")
+            n_replicas = len(column) if n_replicas is None else n_replicas
+            if len(column) != n_replicas:
+                raise InputError(name, f"{len(column)} values", f"one for each of {n_replicas} replicas")
+        if n_replicas is None:
+            raise InputError("n_replicas", None, "given, or a vector of values")
+        checks.at_least("n_replicas", n_replicas, 1)
+        own = [{name: _number(column[r]) for name, column in columns.items()} for r in range(n_replicas)]
+        return cls(tuple(replace(learner, **values) for values in own), threads, block, layout, backend)
+
+    def __len__(self) -> int:
+        return len(self.learners)
+
+    @property
+    def workers(self) -> int:
+        return self.threads or os.cpu_count() or 1
+
+    def fit(self, experience: Experience, n_states: int, n_actions: int) -> ReplicaSolution:
+        """Run all to the end. Raises InputError: what the learners raise, or streams that are not one a replica."""
+        history: list[dict[str, np.ndarray]] = []
+        state: ReplicaState | None = None
+        for state in self.iterate(experience, n_states, n_actions):
+            history.append(state.metrics())
+        assert state is not None
+        return self.solution(state, history)
+
+    def iterate(self, experience: Experience, n_states: int, n_actions: int) -> Iterator[ReplicaState]:
+        """Yield the state of all replicas after each epoch, until the last is done or has failed."""
+        self._check(experience, n_states, n_actions)
+        from erl_torch.learners.s1_lanes import can_interleave, interleave
+
+        run = interleave if can_interleave(self, experience) else each
+        return run(self, experience, n_states, n_actions)
+
+    def solution(self, state: ReplicaState, history: Sequence[dict[str, np.ndarray]] = ()) -> ReplicaSolution:
+        """The solutions that ``state`` stands for; ``history`` holds one ``metrics()`` an epoch."""
+        solutions = []
+        for r, learner in enumerate(self.learners):
+            own = state.replica(r)
+            rows: list[dict[str, float]] = []
+            for row in history:
+                if rows and row["n_tuples"][r] == rows[-1]["n_tuples"]:
+                    break  # stopped before the others
+                rows.append({name: values[r].item() for name, values in row.items()})
+            solutions.append(learner.solution(own, rows, state.failures.get(r)))
+        return ReplicaSolution(tuple(solutions), state.failures)
+
+    def prior_policy(self, n_states: int, n_actions: int) -> np.ndarray:
+        """[S, A], the one of all replicas."""
+        return check_policy("prior_policy", self.learners[0].prior_policy, n_states, n_actions)
+
+    def _check(self, experience: Experience, n_states: int, n_actions: int) -> None:
+        prior = self.prior_policy(n_states, n_actions)
+        for r, learner in enumerate(self.learners):
+            own = learner.prior_policy
+            if own is not self.learners[0].prior_policy and not np.array_equal(
+                check_policy("prior_policy", own, n_states, n_actions), prior
+            ):
+                raise InputError(f"learners[{r}].prior_policy", "array", "that of all replicas")
+        if isinstance(experience, Transitions):
+            return
+        streams = experience.seeds if isinstance(experience, Simulation) else experience
+        if len(streams) != len(self):
+            raise InputError("experience", f"{len(streams)} streams", f"one, or one for each of {len(self)} replicas")
+        if isinstance(experience, Simulation) and experience.mdp.reward.shape != (n_states, n_actions):
+            shape = experience.mdp.reward.shape
+            raise InputError("experience", f"an MDP of shape {shape}", f"of shape {(n_states, n_actions)}")
+
+
+def _number(value: Any) -> Any:
+    """A plain number of a NumPy or torch scalar."""
+    return value.item() if hasattr(value, "item") else value
+
+
+def tuples_of(experience: Experience, r: int, prior: np.ndarray) -> Transitions:
+    """The stream of one replica."""
+    if isinstance(experience, Transitions):
+        return experience
+    return experience.stream(r, prior) if isinstance(experience, Simulation) else experience[r]
+
+
+def fits(experience: Experience, n_replicas: int, tuple_bytes: int) -> bool:
+    """Whether the tuples of all replicas are to be kept, at so many bytes each."""
+    if isinstance(experience, Simulation):
+        n_tuples = experience.n_tuples
+        if experience.keep is not None:
+            return experience.keep
+    else:
+        n_tuples = len(experience if isinstance(experience, Transitions) else experience[0])
+    return n_tuples * n_replicas * tuple_bytes <= KEEP_BYTES
+
+
+# -- a replica a thread -------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class EachState:
+    """States of learners that run beside each other."""
+
+    states: tuple[Any, ...]
+    failures: Mapping[int, NonFiniteError]
+
+    @property
+    def n_tuples(self) -> int:
+        return max(state.n_tuples for state in self.states)
+
+    @property
+    def policy(self) -> torch.Tensor:
+        return torch.stack([state.policy for state in self.states])
+
+    def replica(self, r: int) -> Any:
+        return self.states[r]
+
+    def metrics(self) -> dict[str, np.ndarray]:
+        rows = [state.metrics() for state in self.states]
+        return {name: np.array([row[name] for row in rows]) for name in rows[0]}
+
+
+def each(replicas: Replicas, experience: Experience, n_states: int, n_actions: int) -> Iterator[EachState]:
+    """``Replicas.iterate`` of any learner that streams. Prepared streams are held where they fit, else made again."""
+    learners, prior = replicas.learners, replicas.prior_policy(n_states, n_actions)
+    held: list[Any] = [None] * len(replicas)
+    hold = fits(experience, len(replicas), PREPARED_BYTES)
+    states = [learner.init(n_states, n_actions) for learner in learners]
+    failures: dict[int, NonFiniteError] = {}
+
+    def go_on(r: int) -> Any:
+        try:
+            stream = held[r]
+            if stream is None:
+                stream = learners[r].prepare(tuples_of(experience, r, prior), n_states, n_actions)
+                held[r] = stream if hold else None
+            return learners[r].step(states[r], stream)
+        except NonFiniteError as error:
+            return error
+
+    with ThreadPoolExecutor(replicas.workers) as pool:
+        while live := [r for r in range(len(replicas)) if r not in failures and not learners[r].finished(states[r])]:
+            for r, after in zip(live, pool.map(go_on, live), strict=True):
+                if isinstance(after, NonFiniteError):
+                    failures[r] = after
+                else:
+                    states[r] = after
+            yield EachState(tuple(states), dict(failures))
