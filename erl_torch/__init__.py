@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from erl_torch.learners.certainty_equivalence import CertaintyEquivalence
     from erl_torch.learners.efficient_s1 import EfficientS1
     from erl_torch.learners.fitting import NonFiniteError
+    from erl_torch.learners.replicas import Replicas, ReplicaSolution, Simulation
     from erl_torch.mdp import TabularMDP
     from erl_torch.models import MeanRewardWarning, tabular_mdp
     from erl_torch.solution import Solution, Status
@@ -42,7 +43,10 @@ _HOME = {
     "InputError": "checks",
     "MeanRewardWarning": "models",
     "NonFiniteError": "learners.fitting",
+    "ReplicaSolution": "learners.replicas",
+    "Replicas": "learners.replicas",
     "S1State": "learners.algorithm_s1",
+    "Simulation": "learners.replicas",
     "Solution": "solution",
     "bootstrap_theta": "uncertainty",
     "certify": "solvers",
@@ -75,7 +79,10 @@ __all__ = [
     "InputError",
     "MeanRewardWarning",
     "NonFiniteError",
+    "ReplicaSolution",
+    "Replicas",
     "S1State",
+    "Simulation",
     "Solution",
     "Status",
     "TabularMDP",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import TracebackType
 from typing import Any
 
@@ -41,6 +41,23 @@ EXACT_LAYOUT = {
     },
     "Reward bias": {"delta": ["Multiline", ["exact/delta_max", "exact/delta_mean"]]},
 } | RETURNS
+
+
+def replica_layout(groups: Sequence[str]) -> dict[str, Any]:
+    """Boards of a run of replicas: the mean in its quartiles and in its extremes, a group below the other."""
+    return {
+        title: {
+            f"{group}: {name}, {band}": ["Margin", [f"{group}/{name}_{key}" for key in ("mean", *ends)]]
+            for group in groups
+            for name in names
+            for band, ends in (("quartiles", ("q25", "q75")), ("extremes", ("min", "max")))
+        }
+        for title, names in {
+            "rho and theta": ("theta", "rho", "empirical_width"),
+            "Reward bias": ("delta_max",),
+            "Returns": ("reward_per_step", "objective", "return"),
+        }.items()
+    }
 
 
 class Board:

@@ -32,6 +32,8 @@ OPEN_NODES = (
     "env.kwargs=",
     "env.tile_rewards.",
     "env.tile_rewards=",
+    "vary.",
+    "vary=",
 )  # keys of the user's own: no schema lists them
 
 

@@ -273,7 +273,11 @@ class Standard:
 @dataclass
 class Train:
     seed: int = 0
-    threads: int = 1
+    n_replicas: int = 1
+    vary: dict[str, Any] = field(default_factory=dict)
+    shared_stream: bool = False
+    keep_tuples: bool | None = None
+    threads: int | None = None
     env: Any = MISSING
     learner: Any = MISSING
     experience: Any = MISSING

@@ -22,6 +22,7 @@ from erl_torch.models import known_mdp, sizes
 from erl_torch.rng import Streams
 from erl_torch.sampling import policy_cdf, sampling_tables
 
+GTH_STATES = 100  # up to here eliminating states is faster than a sparse LU
 DENSE_STATES = 2000  # up to here a nearly reducible chain is solved densely: seconds, 32 MB
 
 
@@ -163,6 +164,56 @@ def evaluate(
     if model is None:
         return sampled
     return Evaluation(played, reward_per_step(model, table, horizon), objective(model, table, prior, beta))
+
+
+class Judge:
+    """Exact figures of many policies of one model, each in compiled code that other threads can run beside.
+
+    Args:
+        mdp: the model.
+        prior: [S, A].
+        horizon: steps behind ``reward_per_step``.
+    """
+
+    def __init__(self, mdp: TabularMDP, prior: np.ndarray, horizon: int) -> None:
+        self.mdp, self.prior, self.horizon = mdp, prior, horizon
+        n_states, n_actions = prior.shape
+        p = mdp.transition
+        n = p.nnz
+        # Where each transition stands in the chain of a policy: the same for all policies.
+        marked = sp.csr_array((np.ones(n), p.indices.copy(), p.indptr[::n_actions].copy()), shape=(n_states, n_states))
+        marked.sum_duplicates()
+        self._rows, self._columns = marked.indptr, marked.indices
+        marked.data = np.arange(marked.nnz, dtype=np.float64)
+        s = np.repeat(np.arange(n_states), np.diff(p.indptr[::n_actions]))
+        self._place = np.asarray(marked[s, p.indices]).astype(np.int64).ravel()
+        label, closed = classes(marked)
+        # With one closed class of moderate size the stationary distribution takes no factorisation.
+        self._inside = np.flatnonzero(closed[label])
+        self._small = closed.sum() == 1 and len(self._inside) <= GTH_STATES
+
+    def reward_per_step(self, policy: np.ndarray) -> float:
+        """As the function of that name, for a policy [S, A]."""
+        reward = (policy * self.mdp.reward).sum(1)
+        chain = self._chain(policy)
+        total = kernels.finite_horizon_return(self._rows, self._columns, chain, reward, self.mdp.start, self.horizon)
+        return float(total) / self.horizon
+
+    def objective(self, policy: np.ndarray, beta: float) -> float:
+        """As the function of that name."""
+        if self._small and (policy > 0).all():
+            chain = sp.csr_array((self._chain(policy), self._columns, self._rows))
+            share = np.asarray(kernels.gth(chain[self._inside][:, self._inside].toarray()))
+            if np.isfinite(share).all():
+                worth = (policy * self.mdp.reward).sum(1) - kl_per_state(policy, self.prior) / beta
+                return float(share @ worth[self._inside])
+        return objective(self.mdp, policy, self.prior, beta)
+
+    def _chain(self, policy: np.ndarray) -> np.ndarray:
+        chain = np.empty(len(self._columns))
+        p = self.mdp.transition
+        kernels.chain_of(p.data, self._place, policy.reshape(-1), p.indptr, chain)
+        return chain
 
 
 def _evaluate_by_playing(

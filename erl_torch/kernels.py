@@ -28,7 +28,7 @@ def compiled_before() -> bool:
 # ---------------------------------------------------------------------------------------------------
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy", nogil=True)
 def visit_counts(pair, n_pairs):
     """Visits of every pair. pair [N] int32 -> [n_pairs] int64."""
     counts = np.zeros(n_pairs, np.int64)
@@ -337,7 +337,7 @@ def shared_epoch(
 # ---------------------------------------------------------------------------------------------------
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy", nogil=True)
 def gauge_epoch(
     pair, after, factor, noisy, g, z, total, average, weight, n_actions, steps, visits, rho, lr_rho, rho_max,
     expected, rescale_every, begin, end,
@@ -394,7 +394,7 @@ def gauge_epoch(
     return rho, True
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy", nogil=True)
 def _log_blend(log_x, log_new, step):
     """log((1 - step) x + step new), for any size of the logarithms."""
     d = log_new - log_x
@@ -404,7 +404,7 @@ def _log_blend(log_x, log_new, step):
     return log_new + math.log(step + (1.0 - step) * math.exp(-d))
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy", nogil=True)
 def _log_row(log_z, log_weight, first, n_actions):
     """log sum_a exp(log_weight + log_z) of one state."""
     top = -np.inf
@@ -416,7 +416,7 @@ def _log_row(log_z, log_weight, first, n_actions):
     return top + math.log(row)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy", nogil=True)
 def log_gauge_epoch(
     pair, after, log_factor, noisy, log_g, log_z, log_total, average, log_weight, n_actions, steps, visits, log_rho,
     lr_rho, log_rho_max, expected, rescale_every, begin, end,
@@ -693,7 +693,7 @@ def simulate_returns(indptr, indices, cdf, reward, start_cdf, policy_cdf, episod
         returns[episode] = total
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy", nogil=True)
 def finite_horizon_return(indptr, indices, data, reward, start, horizon):
     """Expected undiscounted sum of ``reward`` [S] over ``horizon`` steps of a chain (CSR [S, S])."""
     now = start.copy()
@@ -710,7 +710,16 @@ def finite_horizon_return(indptr, indices, data, reward, start, horizon):
     return total
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def chain_of(data, place, policy, indptr, chain):
+    """Chain of a policy [n_pairs]: entry m of the transition matrix (CSR rows ``indptr``) goes to chain[place[m]]."""
+    chain[:] = 0.0
+    for k in range(indptr.size - 1):
+        for m in range(indptr[k], indptr[k + 1]):
+            chain[place[m]] += policy[k] * data[m]
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
 def gth(p):
     """Stationary distribution [S] of one closed class, dense p [S, S] (destroyed), without a subtraction.
 
@@ -767,7 +776,7 @@ def smooth_wind(wind, noise):
 # ---------------------------------------------------------------------------------------------------
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy", nogil=True)
 def tilt_rows(indptr, indices, data, h, log_mean, kl, tilted):
     """For each row: log_mean = log sum_j p_j exp(h_j), tilted_j = p_j exp(h_j - log_mean), and
     kl = sum_j tilted_j log(tilted_j / p_j).
@@ -845,7 +854,7 @@ def count_rows(cells, n_cells):
 # ---------------------------------------------------------------------------------------------------
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy", nogil=True)
 def backed_up(q, visits, prior, beta, first, last, backup):
     """V of the state whose pairs are first..last; pairs without visits are left out, and V = 0 where all are.
 
@@ -874,7 +883,7 @@ def backed_up(q, visits, prior, beta, first, last, backup):
     return top + math.log(total / mass) / beta
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy", nogil=True)
 def log_mix(x, step):
     """log(1 - step + step exp(x)) for any x and 0 < step <= 1."""
     if x > 0.0:
@@ -884,7 +893,7 @@ def log_mix(x, step):
     return math.log1p(step * math.expm1(x))
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy", nogil=True)
 def action_value_epoch(
     pair,
     s_next,

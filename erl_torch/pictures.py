@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -139,18 +139,79 @@ def learning_curves(sizes: Sequence[int], curves: Mapping[str, Sequence[Mapping[
             at, low, high = np.array(bands).T
             axes.fill_between(at, np.maximum(low, 1e-300), high, color=colour, alpha=0.18, linewidth=0, zorder=2)
         ends.append((y[-1], name, colour))
-    axes.grid(True, which="major", color="#dddddd", linewidth=0.8, zorder=0)
-    axes.set_axisbelow(True)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-    axes.tick_params(which="both", colors="#444444", labelsize=9)
-    axes.set_xlabel("tuples of experience", fontsize=10)
-    axes.set_ylabel("gap  g* \u2212 J,  reward a step", fontsize=10)
+    _plain(axes, "tuples of experience", "gap  g* \u2212 J,  reward a step")
     axes.set_xlim(sizes[0] / 1.15 if len(sizes) > 1 else sizes[0] / 2, sizes[-1])
     figure.text(0.095, 0.945, title, fontsize=11, weight="bold")
     figure.text(0.095, 0.908, "interquartile mean over seeds, bootstrap 95 % band", fontsize=8.5, color="#666666")
     _name_ends(axes, sorted(ends))
     return _pixels(figure)
+
+
+class BandLine(NamedTuple):
+    """A line with its bands for ``bands``."""
+
+    name: str
+    x: Sequence[float]
+    statistics: Sequence[Mapping[str, float]]  # mean, q25, q75, min, max at each x
+    exact: Sequence[float | None]  # at each x, drawn dashed
+
+
+def bands(panels: Mapping[str, Sequence[BandLine]], x_label: str, title: str, markers: bool = False) -> np.ndarray:
+    """Statistics over replicas, a panel for each label: mean, quartiles (shaded), extremes (thin)."""
+    figure, all_axes = _panels(len(panels), title, "mean; shaded: quartiles; thin: extremes; dashed: exact")
+    for axes, (label, lines) in zip(all_axes, panels.items(), strict=True):
+        for i, line in enumerate(lines):
+            colour = COLOURS[i % len(COLOURS)]
+            column = {key: [p[key] for p in line.statistics] for key in ("mean", "q25", "q75", "min", "max")}
+            style: dict[str, Any] = {"marker": "o", "markersize": 3} if markers else {}
+            axes.plot(line.x, column["mean"], color=colour, linewidth=1.5, label=line.name, zorder=3, **style)
+            axes.fill_between(line.x, column["q25"], column["q75"], color=colour, alpha=0.22, linewidth=0, zorder=2)
+            for end in ("min", "max"):
+                axes.plot(line.x, column[end], color=colour, linewidth=0.5, alpha=0.8, zorder=2)
+            known = [(x, y) for x, y in zip(line.x, line.exact, strict=True) if y is not None]
+            if known:
+                axes.plot(*zip(*known, strict=True), color="#222222" if len(lines) == 1 else colour, linestyle="--",
+                          linewidth=1.0, zorder=2.5)  # fmt: skip
+        spread = [x for line in lines for x in line.x]
+        if markers and min(spread) > 0 and max(spread) / min(spread) >= 20:
+            axes.set_xscale("log")
+        _plain(axes, x_label, label)
+        if len(lines) > 1 and axes is all_axes[0]:
+            axes.legend(fontsize=7, frameon=False)
+    return _pixels(figure)
+
+
+def shrunk(picture: np.ndarray, max_px: int = MAX_PX) -> np.ndarray:
+    """A picture [H, W, 3] in whole fractions of its size, at most about ``max_px`` wide."""
+    n = max(1, round(picture.shape[1] / max_px))
+    height, width = (size // n * n for size in picture.shape[:2])
+    blocks = picture[:height, :width].reshape(height // n, n, width // n, n, 3)
+    return np.asarray(blocks.mean((1, 3)).round(), dtype=np.uint8)
+
+
+def _panels(n: int, title: str, caption: str) -> tuple[Figure, list[Axes]]:
+    columns = 1 if n == 1 else 2
+    rows = -(-n // columns)
+    width, height = 4.6 * columns, 2.9 * rows + 0.6
+    figure = Figure(figsize=(width, height), dpi=130)
+    panels = []
+    for i in range(n):
+        row, column = divmod(i, columns)
+        left, bottom = (4.6 * column + 0.85) / width, (2.9 * (rows - 1 - row) + 0.55) / height
+        panels.append(figure.add_axes((left, bottom, 3.55 / width, 2.15 / height)))
+    figure.text(0.85 / width, 1 - 0.28 / height, title, fontsize=11, weight="bold")
+    figure.text(0.85 / width, 1 - 0.48 / height, caption, fontsize=8, color="#666666")
+    return figure, panels
+
+
+def _plain(axes: Axes, x_label: str, y_label: str) -> None:
+    axes.grid(True, which="major", color="#dddddd", linewidth=0.8, zorder=0)
+    axes.set_axisbelow(True)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    axes.tick_params(which="both", colors="#444444", labelsize=8)
+    axes.set_xlabel(x_label, fontsize=9)
+    axes.set_ylabel(y_label, fontsize=9)
 
 
 def _name_ends(axes: Axes, ends: list[tuple[float, str, str]]) -> None:

@@ -100,21 +100,29 @@ class Solution:
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write everything to an npz file; the history's arrays are named ``history/...``."""
-        arrays: dict[str, object] = {}
+        return write_npz(path, self.arrays())
+
+    def arrays(self, history: bool = True) -> dict[str, np.ndarray]:
+        """Everything by name, as ``save`` writes it."""
+        found: dict[str, Any] = {}
         for item in fields(self):
             value = getattr(self, item.name)
             if item.name == "history":
-                arrays |= {f"history/{name}": values for name, values in value.items()}
+                found |= {f"history/{name}": values for name, values in value.items()} if history else {}
             elif isinstance(value, torch.Tensor):
-                arrays[item.name] = value.detach().cpu().numpy()
+                found[item.name] = value.detach().cpu().numpy()
             elif value is not None:
-                arrays[item.name] = value.name if isinstance(value, Status) else value
-        return write_npz(path, arrays)
+                found[item.name] = value.name if isinstance(value, Status) else value
+        return {name: np.asarray(value) for name, value in found.items()}
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Solution:
         """Read what ``save`` wrote. Raises InputError naming the file."""
-        arrays = read_npz(path)
+        return cls.of_arrays(read_npz(path), path)
+
+    @classmethod
+    def of_arrays(cls, arrays: Mapping[str, np.ndarray], path: str | os.PathLike[str]) -> Solution:
+        """The solution of ``arrays``, read from ``path``. Raises InputError naming the file."""
         values: dict[str, Any] = {"history": {}}
         for name, array in arrays.items():
             if name.startswith("history/"):

@@ -63,12 +63,22 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
     began = time.perf_counter()
     check_keys(cfg)
     checks.at_least("seed", cfg.seed, 0)
-    checks.at_least("threads", cfg.threads, 1)
-    torch.set_num_threads(cfg.threads)
+    checks.at_least("n_replicas", cfg.n_replicas, 1)
+    if cfg.threads is not None:
+        checks.at_least("threads", cfg.threads, 1)
+    many = cfg.n_replicas > 1 or cfg.vary
+    torch.set_num_threads(1 if many else cfg.threads or 1)
     if not kernels.compiled_before():
         print("compiling the loops, about ten seconds: on the first run only", file=sys.stderr)
-    rng = streams(cfg.seed)
     _check_evaluation(cfg.evaluation)
+    if many:
+        from erl_torch.replicated import train_replicas
+
+        return train_replicas(cfg, directory, safe_point)
+    for key in ("shared_stream", "keep_tuples"):
+        if cfg[key]:
+            raise InputError(key, cfg[key], "left out, or used with n_replicas > 1 or vary.KEY=[...]")
+    rng = streams(cfg.seed)
     env = make_env(cfg.env)
     with contextlib.closing(env):
         world = make_world(cfg.env, env, safe_point)
@@ -91,7 +101,7 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
         history: list[dict[str, float]] = []
         stopped: BaseException | None = None
         clock = _Stopwatch()
-        hyperparameters = _flat({**cfg.learner, "seed": cfg.seed, "n_experience": run.n_experience})
+        hyperparameters = flat({**cfg.learner, "seed": cfg.seed, "n_experience": run.n_experience})
         with Board(directory, hyperparameters, run.layout) as board:
             board.text("configuration", f"```yaml\n{OmegaConf.to_yaml(cfg, resolve=True)}```")
             first = last = measure(state.policy)
@@ -192,7 +202,7 @@ class _Learning:
 
     def bar(self) -> tqdm:
         passes = getattr(self.learner, "n_bias", 1) * getattr(self.learner, "n_epochs", 1)
-        return _bar(passes * self.n_experience, self.unit)
+        return learning_bar(passes * self.n_experience, self.unit)
 
     def solution(self, state: Any, history: list[dict[str, float]], stopped: BaseException | None) -> Solution:
         failure = stopped if isinstance(stopped, NonFiniteError) else None
@@ -251,7 +261,7 @@ class _Solving:
         return f"theta {state.theta:.6f} in [{state.theta_bounds[0]:.6f}, {state.theta_bounds[1]:.6f}]"
 
     def bar(self) -> tqdm:
-        return _bar(None, self.unit)
+        return learning_bar(None, self.unit)
 
     def solution(self, state: ExactState, history: list[dict[str, float]], stopped: BaseException | None) -> Solution:
         return self.learner.solution(self.mdp, state, history, stopped is not None)
@@ -260,7 +270,7 @@ class _Solving:
         return None
 
 
-def _bar(total: int | None, unit: str) -> tqdm:
+def learning_bar(total: int | None, unit: str) -> tqdm:
     return tqdm(
         total=total, desc="learning", unit=f" {unit}", unit_scale=True, disable=None,
         bar_format="{l_bar}{bar:20}| {elapsed}<{remaining}, {rate_fmt}{postfix}" if total else None,
@@ -405,6 +415,17 @@ def make_learner(cfg: DictConfig, n_states: int, n_actions: int, key: str = "lea
         return learner
 
 
+def recorded(cfg: DictConfig, n_states: int, n_actions: int) -> Transitions:
+    """The stream that ``cfg`` names. Raises InputError."""
+    with _group("experience"):
+        data = Transitions.load(cfg.path)
+        try:
+            data.check_range(n_states, n_actions)
+        except InputError as error:
+            raise InputError(f"path={cfg.path}: {error.key}", error.value, error.allowed) from error
+        return data
+
+
 def _experience(
     cfg: DictConfig,
     source: TabularMDP | gym.Env[Any, Any],
@@ -414,14 +435,9 @@ def _experience(
     prior: np.ndarray,
     safe_point: Callable[[], None],
 ) -> Transitions:
+    if cfg.name == "recorded":
+        return recorded(cfg, n_states, n_actions)
     with _group("experience"):
-        if cfg.name == "recorded":
-            data = Transitions.load(cfg.path)
-            try:
-                data.check_range(n_states, n_actions)
-            except InputError as error:
-                raise InputError(f"path={cfg.path}: {error.key}", error.value, error.allowed) from error
-            return data
         behaviour = None
         if cfg.behaviour_policy is not None:
             behaviour = read_npy(cfg.behaviour_policy, "behaviour_policy")
@@ -485,14 +501,26 @@ def _result(
         "n_tuples" if n_data else "n_iterations": solution.n_steps,
         "seconds_learning": round(learning, 3),
         "seconds": round(seconds, 3),
-        "versions": {
-            "erl_torch": erl_torch.__version__,
-            "python": platform.python_version(),
-            "torch": torch.__version__,
-            "numpy": np.__version__,
-            "gymnasium": gym.__version__,
-        },
+        "versions": versions(),
     }
+
+
+def versions() -> dict[str, str]:
+    """Of what a result depends on."""
+    return {
+        "erl_torch": erl_torch.__version__,
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "numpy": np.__version__,
+        "gymnasium": gym.__version__,
+    }
+
+
+def where(directory: Path) -> tuple[Path, Path | str]:
+    """A run directory as a user would write it, and what to give TensorBoard."""
+    with contextlib.suppress(ValueError):
+        directory = directory.resolve().relative_to(Path.cwd())
+    return directory, "runs" if directory.parts[0] == "runs" else directory
 
 
 def _summary(
@@ -504,9 +532,7 @@ def _summary(
     directory: Path,
     unit: str,
 ) -> str:
-    with contextlib.suppress(ValueError):
-        directory = directory.resolve().relative_to(Path.cwd())
-    logs = "runs" if directory.parts[0] == "runs" else directory
+    directory, logs = where(directory)
     done = result[f"n_{unit}"]
     is_s1 = isinstance(start, S1State)
     rows = [
@@ -546,6 +572,6 @@ def _summary(
     return "\n".join(lines)
 
 
-def _flat(values: dict[str, Any]) -> dict[str, Any]:
+def flat(values: dict[str, Any]) -> dict[str, Any]:
     """Hyper-parameters as TensorBoard takes them: numbers, booleans and text."""
     return {key: value if isinstance(value, (bool, int, float, str)) else str(value) for key, value in values.items()}

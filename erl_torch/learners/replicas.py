@@ -23,6 +23,7 @@ import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -31,6 +32,7 @@ import torch
 from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.experience import collect
+from erl_torch.files import read_npz, write_npz
 from erl_torch.learners.algorithm_s1 import AlgorithmS1
 from erl_torch.learners.fitting import NonFiniteError
 from erl_torch.mdp import TabularMDP, check_policy
@@ -126,6 +128,26 @@ class ReplicaSolution:
         if isinstance(values[0], float):
             return torch.tensor(values, dtype=torch.float64)
         return values
+
+    def save(self, path: str | os.PathLike[str], more: Mapping[str, np.ndarray] | None = None) -> Path:
+        """Write all solutions to one npz file: the arrays of ``Solution.save`` with a leading axis [R], and ``more``.
+
+        Histories stay out: they end where their replica did.
+        """
+        rows = [solution.arrays(history=False) for solution in self.solutions]
+        names = {name for row in rows for name in row}
+        whole = {name: np.stack([row[name] for row in rows]) for name in sorted(names) if all(name in r for r in rows)}
+        return write_npz(path, whole | dict(more or {}))
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> ReplicaSolution:
+        """Read what ``save`` wrote. Raises InputError naming the file."""
+        arrays = read_npz(path)
+        known = [f.name for f in fields(Solution) if f.name in arrays]
+        if "policy" not in known:
+            raise InputError("path", path, "the solutions of replicas as ReplicaSolution.save writes them")
+        rows = ({name: arrays[name][r] for name in known} for r in range(len(arrays["policy"])))
+        return cls(tuple(Solution.of_arrays(row, path) for row in rows))
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,9 +288,9 @@ def fits(experience: Experience, n_replicas: int, tuple_bytes: int) -> bool:
     if isinstance(experience, Simulation):
         n_tuples = experience.n_tuples
         if experience.keep is not None:
-            return experience.keep
+            return bool(experience.keep)
     else:
-        n_tuples = len(experience if isinstance(experience, Transitions) else experience[0])
+        n_tuples = max(len(data) for data in ([experience] if isinstance(experience, Transitions) else experience))
     return n_tuples * n_replicas * tuple_bytes <= KEEP_BYTES
 
 
@@ -284,7 +306,7 @@ class EachState:
 
     @property
     def n_tuples(self) -> int:
-        return max(state.n_tuples for state in self.states)
+        return max(int(state.n_tuples) for state in self.states)
 
     @property
     def policy(self) -> torch.Tensor:

@@ -18,7 +18,8 @@ import torch
 
 from erl_torch import kernels
 from erl_torch.checks import InputError
-from erl_torch.learners.algorithm_s1 import AlgorithmS1, S1State, gains, line_12, positive, reward_biases
+from erl_torch.learners import s1_torch
+from erl_torch.learners.algorithm_s1 import AlgorithmS1, S1State, S1Stream, gains, line_12, positive, reward_biases
 from erl_torch.learners.fitting import NonFiniteError
 from erl_torch.learners.replicas import TUPLE_BYTES, Experience, Replicas, Simulation, fits, tuples_of
 from erl_torch.rng import streams
@@ -214,6 +215,8 @@ class Engine:
 
     def _blocks(self) -> list[slice]:
         n, block = len(self.replicas), self.replicas.block
+        if self._on_torch:
+            return [slice(0, n)]
         if block is None:
             most = max(8, min(LANES, SMALL_TABLES // self.n_pairs))
             # As even as can be, and as many as there are threads to work on them.
@@ -222,15 +225,24 @@ class Engine:
             block = -(-n // count)
         return [slice(first, min(first + block, n)) for first in range(0, n, block)]
 
-    def _side_by_side(self, lanes: int) -> bool:
+    def _side_by_side(self, part: slice) -> bool:
         if self.replicas.layout == "auto":
-            return lanes * self.n_pairs <= SMALL_TABLES
+            return bool((part.stop - part.start) * self.n_pairs <= SMALL_TABLES)
         return self.replicas.layout == "lanes"
+
+    def _steps(self, part: slice, side_by_side: bool) -> tuple[int, int]:
+        """Strides of a block's flat tables: from pair to pair, from lane to lane."""
+        return (part.stop - part.start, 1) if side_by_side else (1, self.n_pairs)
+
+    @cached_property
+    def _on_torch(self) -> bool:
+        backend = self.replicas.backend
+        return backend == "torch" or (backend == "auto" and str(torch.device(self.learner.device).type) != "cpu")
 
     def _sampled(self, simulation: Simulation, pool: ThreadPoolExecutor) -> Lanes:
         mdp, n_tuples = simulation.mdp, simulation.n_tuples
         behaviour = self.prior if simulation.behaviour_policy is None else simulation.behaviour_policy
-        keep = self.replicas.backend != "torch" and fits(simulation, len(self.replicas), TUPLE_BYTES)
+        keep = fits(simulation, len(self.replicas), TUPLE_BYTES)
         lr_psi = np.array([learner.lr_psi for learner in self.replicas.learners])
         n, nnz = len(self.replicas), mdp.transition.nnz
         visits = np.zeros((n, self.n_pairs), np.int64)
@@ -243,8 +255,7 @@ class Engine:
 
         def survey(part: slice) -> Block:
             source = sampler(part)
-            lanes = part.stop - part.start
-            kept = np.empty((2, n_tuples if keep else 0, lanes), np.int32)
+            kept = np.empty((2, n_tuples if keep else 0, part.stop - part.start), np.int32)
             for begin in range(0, n_tuples, ROWS):
                 rows = min(ROWS, n_tuples - begin)
                 pair, entry, pair_next = source.take(rows)
@@ -286,9 +297,9 @@ class Engine:
         learners, shared = self.replicas.learners, isinstance(self.experience, Transitions)
         n = len(learners)
 
-        def prepared(r: int) -> Any:
-            # At beta 1 rewards do not overflow here; each replica's own bound follows below.
-            learner = replace(learners[r], beta=1e-300)
+        def prepared(r: int) -> S1Stream:
+            # Streams are the same at any beta, but for what is made of beta below; at this one nothing overflows.
+            learner: AlgorithmS1 = replace(learners[r], beta=1e-300)
             return learner.prepare(tuples_of(self.experience, r, self.prior), self.n_states, self.n_actions)
 
         if shared:
@@ -325,22 +336,24 @@ class Engine:
 
     def _lanes_block(self, part: slice, pair: np.ndarray, pair_next: np.ndarray, r: np.ndarray | None) -> Block:
         """A recorded stream a lane; columns [N, lanes], rewards only where they vary."""
-        lanes = part.stop - part.start
-        side_by_side = self._side_by_side(lanes)
-        steps = (lanes, 1) if side_by_side else (1, self.n_pairs)
+        if self._on_torch:
+            return self._torch_block(part, lambda i, j: (pair[i:j], pair_next[i:j]), r)
+        side_by_side = self._side_by_side(part)
 
         def run(begin: int, end: int, g: Any, z: Any, q: Any, rates: Any, failed: Any) -> None:
             for first, stop, factor in self._factors(part, r, begin, end):
                 kernels.lanes_epoch(
-                    pair[first:stop], pair_next[first:stop], factor, r is not None, g, z, q, *rates, self._new, *steps,
-                    self._rescale, failed, first, stop,
+                    pair[first:stop], pair_next[first:stop], factor, r is not None, g, z, q, *rates, self._new,
+                    *self._steps(part, side_by_side), self._rescale, failed, first, stop,
                 )  # fmt: skip
 
         return Block(part, run, side_by_side)
 
-    def _shared_block(self, part: slice, stream: Any) -> Block:
+    def _shared_block(self, part: slice, stream: S1Stream) -> Block:
         """One recorded stream for all lanes."""
         r = stream.data.r[:, None] if stream.noisy else None
+        if self._on_torch:
+            return self._torch_block(part, lambda i, j: (stream.pair[i:j, None], stream.pair_next[i:j, None]), r)
 
         def run(begin: int, end: int, g: Any, z: Any, q: Any, rates: Any, failed: Any) -> None:
             for first, stop, factor in self._factors(part, r, begin, end):
@@ -353,22 +366,39 @@ class Engine:
 
     def _sampled_block(self, part: slice, sampler: Callable[[], Sampler]) -> Block:
         """Lanes that are sampled again in every pass."""
-        lanes = part.stop - part.start
-        side_by_side = self._side_by_side(lanes)
-        steps = (lanes, 1) if side_by_side else (1, self.n_pairs)
-        buffers = tuple(np.empty((ROWS, lanes), np.int32) for _ in range(3))
+        side_by_side = self._side_by_side(part)
+        buffers = tuple(np.empty((ROWS, part.stop - part.start), np.int32) for _ in range(3))
         source: list[Sampler] = []
 
-        def run(begin: int, end: int, g: Any, z: Any, q: Any, rates: Any, failed: Any) -> None:
-            if begin == 0:
+        def rows(first: int, stop: int) -> tuple[np.ndarray, np.ndarray]:
+            if first == 0:
                 source[:] = [sampler()]
-            (s,) = source
+            pair, _, pair_next = source[0].take(stop - first)
+            return pair, pair_next
+
+        def run(begin: int, end: int, g: Any, z: Any, q: Any, rates: Any, failed: Any) -> None:
+            s = sampler()
             kernels.sampled_epoch(
-                s.tables, s.environment, s.behaviour, s.now, buffers, g, z, q, *rates, self._new, *steps,
-                self._rescale, failed, begin, end,
+                s.tables, s.environment, s.behaviour, s.now, buffers, g, z, q, *rates, self._new,
+                *self._steps(part, side_by_side), self._rescale, failed, begin, end,
             )  # fmt: skip
 
-        return Block(part, run, side_by_side)
+        return self._torch_block(part, rows, None) if self._on_torch else Block(part, run, side_by_side)
+
+    def _torch_block(
+        self, part: slice, pairs: Callable[[int, int], tuple[np.ndarray, np.ndarray]], r: np.ndarray | None
+    ) -> Block:
+        """Any of the above, in torch operations."""
+
+        def rows(first: int, stop: int) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+            factor = None if r is None else np.exp(self.beta[part] * r[first:stop])
+            return *pairs(first, stop), factor
+
+        def run(begin: int, end: int, g: Any, z: Any, q: Any, rates: Any, failed: Any) -> None:
+            device = self.learner.device
+            s1_torch.u_phase(rows, begin, end, g, z, q, rates, self._new, self._rescale, failed, device)
+
+        return Block(part, run, True)
 
     def _factors(
         self, part: slice, r: np.ndarray | None, begin: int, end: int

@@ -1,0 +1,535 @@
+"""One run of many replicas, from a configuration to a run directory; Hydra stays outside.
+
+The directory holds the event file, ``result.json`` (statistics a group), ``replicas.npz`` (``ReplicaSolution``, and the
+record of every replica), ``bands.png`` and, where settings vary, ``sweep.png``.
+
+A group is a set of replicas with the same settings; its replicas have the seeds seed, seed + 1, ..., and each is the
+run that ``train.py`` makes of that seed alone, bit for bit.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from omegaconf import DictConfig, OmegaConf
+from tqdm import tqdm
+
+from erl_torch import checks, pictures
+from erl_torch.board import Board, replica_layout
+from erl_torch.checks import InputError
+from erl_torch.evaluation import Judge, evaluate
+from erl_torch.experience import collect
+from erl_torch.files import read_npy, write_json, write_png
+from erl_torch.learners import Exact, NonFiniteError
+from erl_torch.learners.replicas import Experience, Replicas, ReplicaSolution, ReplicaState, Simulation
+from erl_torch.mdp import TabularMDP
+from erl_torch.models import known_mdp, sizes
+from erl_torch.rng import streams
+from erl_torch.solution import Status
+from erl_torch.solvers import solve_soft_bellman
+from erl_torch.training import (
+    SMALL,
+    SafePoint,
+    World,
+    learning_bar,
+    make_env,
+    make_learner,
+    make_world,
+    recorded,
+    versions,
+    where,
+)
+from erl_torch.transitions import Transitions
+
+QUANTITIES = {
+    "theta": "theta, reward a step",
+    "rho": "rho",
+    "delta_max": "largest reward bias, reward",
+    "empirical_width": "bound on the loss in the empirical model, reward a step",
+    "reward_per_step": "reward a step",
+    "objective": "objective J, reward a step",
+    "return": "return of an episode, reward",
+}  # what is logged of replicas, as far as there is
+MOST_LOGGED = 24  # groups with curves of their own; all are in result.json and in the pictures
+
+
+@dataclass(frozen=True)
+class Group:
+    """Replicas with the same settings."""
+
+    settings: Mapping[str, float]  # those that vary
+    members: slice
+    beta: float
+
+    @property
+    def name(self) -> str:
+        """As a part of tags: ``replicas``, or ``beta_2``."""
+        return "-".join(f"{key}_{value:g}" for key, value in self.settings.items()) or "replicas"
+
+    @property
+    def title(self) -> str:
+        return ", ".join(f"{key} {value:g}" for key, value in self.settings.items())
+
+
+def train_replicas(cfg: DictConfig, directory: Path, safe_point: SafePoint) -> dict[str, Any]:
+    """Run ``cfg``, which ``erl_torch.training.train`` has checked; returns what ``result.json`` holds.
+
+    Raises:
+        InputError: a key or value that cannot be used, before anything is learnt or written.
+        NonFiniteError: replicas left the finite numbers; everything is written, the others to their end.
+    """
+    began = time.perf_counter()
+    env = make_env(cfg.env)
+    with contextlib.closing(env):
+        world = make_world(cfg.env, env, safe_point)
+        n_states, n_actions = sizes(env)
+        learner = make_learner(cfg.learner, n_states, n_actions)
+        if isinstance(learner, Exact):
+            raise InputError("learner", "exact", "one that learns from experience: replicas of it would be the same")
+        groups = _groups(cfg)
+        threads = cfg.threads or os.cpu_count() or 1
+        learners = [_with(learner, group.settings) for group in groups for _ in range(cfg.n_replicas)]
+        for one in learners[:: cfg.n_replicas]:
+            one.init(n_states, n_actions)
+        replicas = Replicas(tuple(learners), threads)
+        seeds = [cfg.seed + i for _ in groups for i in range(cfg.n_replicas)]
+        prior = replicas.prior_policy(n_states, n_actions)
+        experience = _experience(cfg, world, seeds, n_states, n_actions, prior, safe_point)
+        n_experience = max(_lengths(experience))
+        judge = _Judges(cfg, env, world, prior, [one.beta for one in learners], seeds, threads)
+
+        record = _Record(groups)
+        stopped: BaseException | None = None
+        state: ReplicaState | None = None
+        history: list[dict[str, np.ndarray]] = []
+        learning = 0.0
+        settings = {
+            **cfg.learner,
+            **{f"vary.{k}": v for k, v in _plain(cfg.vary).items()},
+            "n_replicas": cfg.n_replicas,
+        }
+        hyperparameters = {k: v if isinstance(v, (bool, int, float, str)) else str(v) for k, v in settings.items()}
+        with Board(directory, hyperparameters, replica_layout([g.name for g in groups[:MOST_LOGGED]])) as board:
+            board.text("configuration", f"```yaml\n{OmegaConf.to_yaml(cfg, resolve=True)}```")
+            record.add(0, judge(np.repeat(prior[None], len(replicas), axis=0), True), board)
+            passes = getattr(learner, "n_bias", 1) * getattr(learner, "n_epochs", 1)
+            try:
+                with learning_bar(passes * n_experience * len(replicas), "tuples") as bar:
+                    tick = time.perf_counter()
+                    for state in replicas.iterate(experience, n_states, n_actions):
+                        learning += time.perf_counter() - tick
+                        metrics = state.metrics()
+                        history.append(metrics)
+                        milestone = _milestone(learner, metrics)
+                        bar.update(int(metrics["n_tuples"].sum()) - bar.n)
+                        if milestone or len(history) % cfg.evaluation.every == 0:
+                            measured = metrics | judge(state.policy.numpy(), bool(milestone))
+                            alive = np.array([r not in state.failures for r in range(len(replicas))])
+                            record.add(state.n_tuples, measured, board, alive)
+                            if milestone:
+                                tqdm.write(f"{milestone}: {record.line()}", file=sys.stderr)
+                        safe_point()
+                        tick = time.perf_counter()
+            except (KeyboardInterrupt, SystemExit) as error:
+                stopped = error
+            if state is None:
+                assert stopped is not None
+                raise stopped
+            solution = replicas.solution(state, history)
+            exact = _exact(cfg, judge.model, groups, prior, cfg.evaluation.horizon)
+            title = f"{cfg.env.name}, {cfg.learner.name}: {cfg.n_replicas} replicas"
+            drawn = {"bands": pictures.bands(record.curves(exact), "tuples streamed, each replica", title)}
+            if cfg.vary:
+                key, panels = _sweep(groups, record, exact)
+                drawn["sweep"] = pictures.bands(panels, key, f"{title}, at the end", markers=True)
+            for name, picture in drawn.items():
+                write_png(directory / f"{name}.png", picture)
+                board.picture(name, pictures.shrunk(picture), state.n_tuples)
+            done = int(history[-1]["n_tuples"].sum())
+            board.scalars({"time/tuples_per_second": done / max(learning, 1e-9)}, state.n_tuples)
+
+    solution.save(directory / "replicas.npz", record.arrays() | {"seed": np.array(seeds), **_columns(groups)})
+    objectives = [record.statistics(group).get("objective") for group in groups]
+    result = {
+        "env": cfg.env.name,
+        "learner": cfg.learner.name,
+        "seed": cfg.seed,
+        "n_replicas": cfg.n_replicas,
+        "vary": _plain(cfg.vary),
+        "status": Status.STOPPED.name.lower() if stopped else _status(solution),
+        "failures": {str(r): str(error) for r, error in solution.failures.items()},
+        "objective": max((found["mean"] for found in objectives if found), default=None),  # of the best group
+        "groups": [
+            {
+                "settings": dict(group.settings),
+                "beta": group.beta,
+                "exact": best,
+                **record.statistics(group),
+            }
+            for group, best in zip(groups, exact, strict=True)
+        ],
+        "n_experience": n_experience,
+        "n_tuples": done,
+        "seconds_learning": round(learning, 3),
+        "seconds": round(time.perf_counter() - began, 3),
+        "versions": versions(),
+    }
+    write_json(directory / "result.json", result)
+    print(_summary(cfg, groups, result, directory))
+    if stopped is not None:
+        raise stopped
+    if solution.failures:
+        raise _as_one(solution.failures, seeds, learners)
+    return result
+
+
+# -- from configuration to objects ------------------------------------------------------------------
+
+
+def _groups(cfg: DictConfig) -> list[Group]:
+    """Every combination of the values that vary, in the order of the configuration."""
+    columns = {}
+    for key, values in _plain(cfg.vary).items():
+        column = values if isinstance(values, list) else [values]
+        if key not in cfg.learner or key in ("name", "prior_policy"):
+            able = ", ".join(k for k in map(str, cfg.learner) if k not in ("name", "prior_policy"))
+            raise InputError(f"vary.{key}", values, f"left out: the settings of the learner are {able}")
+        if not column or not all(checks.is_number(value) for value in column):
+            raise InputError(f"vary.{key}", values, "a list of numbers")
+        columns[key] = column
+    found = []
+    for i, values in enumerate(itertools.product(*columns.values())):
+        settings = dict(zip(columns, values, strict=True))
+        members = slice(i * cfg.n_replicas, (i + 1) * cfg.n_replicas)
+        found.append(Group(settings, members, float(settings.get("beta", cfg.learner.beta))))
+    return found
+
+
+def _plain(node: DictConfig) -> dict[str, Any]:
+    found: Any = OmegaConf.to_container(node)
+    return {str(key): value for key, value in found.items()}
+
+
+def _with(learner: Any, settings: Mapping[str, float]) -> Any:
+    try:
+        return replace(learner, **settings)
+    except InputError as error:
+        raise error.within("vary") from error
+
+
+def _experience(
+    cfg: DictConfig,
+    world: World,
+    seeds: list[int],
+    n_states: int,
+    n_actions: int,
+    prior: np.ndarray,
+    safe_point: SafePoint,
+) -> Experience:
+    shared = cfg.shared_stream or cfg.experience.name == "recorded"
+    if shared and cfg.n_replicas > 1:
+        said = "1: on one stream, replicas with the same settings would be the same (let settings vary, vary.KEY=[...])"
+        raise InputError("n_replicas", cfg.n_replicas, said)
+    if cfg.experience.name == "recorded":
+        return recorded(cfg.experience, n_states, n_actions)
+    e = cfg.experience
+    if e.save_to is not None and not shared:
+        raise InputError("experience.save_to", e.save_to, "null: there is a stream a replica (or shared_stream=true)")
+    behaviour = None if e.behaviour_policy is None else read_npy(e.behaviour_policy, "experience.behaviour_policy")
+    if shared:
+        data = collect(world.source, e.n_episodes, e.episode_length, cfg.seed, behaviour, prior)
+        if e.save_to is not None:
+            data.save(e.save_to)
+        return data
+    mdp = known_mdp(world.source)
+    if mdp is not None:
+        return Simulation(mdp, e.n_episodes, e.episode_length, seeds, behaviour, cfg.keep_tuples)
+    made: dict[int, Transitions] = {}
+    for seed in tqdm(sorted(set(seeds)), desc="collecting", unit=" streams", delay=1, leave=False, disable=None):
+        made[seed] = collect(world.source, e.n_episodes, e.episode_length, seed, behaviour, prior)
+        safe_point()
+    return [made[seed] for seed in seeds]
+
+
+def _lengths(experience: Experience) -> list[int]:
+    if isinstance(experience, Simulation):
+        return [experience.n_tuples]
+    return [len(data) for data in ([experience] if isinstance(experience, Transitions) else experience)]
+
+
+class _Judges:
+    """Figures of the policies of all replicas: exact ones of the model, and episodes played at milestones."""
+
+    def __init__(
+        self,
+        cfg: DictConfig,
+        env: gym.Env[Any, Any],
+        world: World,
+        prior: np.ndarray,
+        betas: list[float],
+        seeds: list[int],
+        threads: int,
+    ) -> None:
+        e = cfg.evaluation
+        self.env, self.prior, self.betas, self.n_episodes = env, prior, betas, e.n_episodes
+        self.rngs = [streams(seed).evaluation for seed in seeds]
+        self.horizon = min(e.horizon, (env.spec and env.spec.max_episode_steps) or e.horizon)
+        self.threads = threads
+        self.model: TabularMDP | None = world.mdp
+        if world.mdp is not None and world.mdp.transition.nnz > e.exact_up_to:
+            self.model = None
+            print("note: a large model (evaluation.exact_up_to): episodes are played instead", file=sys.stderr)
+        # An episode's return is the model's where the environment is the model.
+        endless = known_mdp(env) is not None and not getattr(env.unwrapped, "ends", np.zeros(1)).any()
+        self.episode = world.episode or (world.mdp if endless else None)
+
+    def __call__(self, policies: np.ndarray, milestone: bool) -> dict[str, np.ndarray]:
+        """Figures of policies [R, S, A], [R] each."""
+        found: dict[str, np.ndarray] = {}
+
+        def each(figure: Callable[[int], float]) -> np.ndarray:
+            with ThreadPoolExecutor(self.threads) as pool:
+                return np.array(list(pool.map(figure, range(len(policies)))))
+
+        if self.model is not None:
+            judge = Judge(self.model, self.prior, self.horizon)
+            found["reward_per_step"] = each(lambda r: judge.reward_per_step(policies[r]))
+            found["objective"] = each(lambda r: judge.objective(policies[r], self.betas[r]))
+        if self.episode is not None:
+            if self.episode is self.model:
+                found["return"] = self.horizon * found["reward_per_step"]
+            else:
+                judge_of_episode = Judge(self.episode, self.prior, self.horizon)
+                found["return"] = self.horizon * each(lambda r: judge_of_episode.reward_per_step(policies[r]))
+        elif milestone:
+            played = [
+                evaluate(self.env, policy, beta, rng, self.n_episodes, self.horizon, self.prior)
+                for policy, beta, rng in zip(policies, self.betas, self.rngs, strict=True)
+            ]
+            found["return"] = np.array([figures.mean_return for figures in played])
+            if self.model is None:
+                found["reward_per_step"] = np.array([figures.reward_per_step for figures in played])
+                found["objective"] = np.array([figures.objective for figures in played])
+        return found
+
+
+def _exact(
+    cfg: DictConfig, model: TabularMDP | None, groups: list[Group], prior: np.ndarray, horizon: int
+) -> list[dict[str, float]]:
+    """What is known of the optimum of each group, by quantity: of a small known model."""
+    if model is None or not cfg.evaluation.certify or model.n_states > SMALL:
+        return [{} for _ in groups]
+    judge = Judge(model, prior, horizon)
+    known: dict[float, dict[str, float]] = {}
+    for beta in {group.beta for group in groups}:
+        best = solve_soft_bellman(model, beta, prior)
+        known[beta] = {}
+        if best.status is Status.CONVERGED and best.theta is not None:
+            reward = judge.reward_per_step(best.policy.numpy())
+            known[beta] = {"theta": best.theta, "objective": -best.theta, "reward_per_step": reward}
+    return [known[group.beta] for group in groups]
+
+
+def _milestone(learner: Any, metrics: Mapping[str, np.ndarray]) -> str:
+    if metrics["epoch"].max() < getattr(learner, "n_epochs", 1):
+        return ""
+    return f"biasing iteration {metrics['bias_iteration'].max()}" if "bias_iteration" in metrics else "last pass"
+
+
+def _status(solution: ReplicaSolution) -> str:
+    """The one that asks for most: what ended badly comes first."""
+    found = {s.status for s in solution.solutions}
+    for status in (Status.NON_FINITE, Status.STOPPED, Status.PSI_LIMIT, Status.STEP_LIMIT):
+        if status in found:
+            return status.name.lower()
+    return sorted(status.name for status in found)[0].lower()
+
+
+def _as_one(failures: Mapping[int, NonFiniteError], seeds: list[int], learners: list[Any]) -> NonFiniteError:
+    r, error = min(failures.items())
+    others = f" ({len(failures)} of {len(seeds)} replicas ended so)" if len(failures) > 1 else ""
+    cause = f"replica {r} (seed {seeds[r]}, beta {learners[r].beta:g}): {error.cause}{others}"
+    return NonFiniteError(error.step, cause)
+
+
+# -- what is recorded and shown -----------------------------------------------------------------------
+
+
+def statistics(values: np.ndarray) -> dict[str, float]:
+    """mean, quartiles and extremes of [n] finite values."""
+    low, middle, high = np.quantile(values, (0.25, 0.5, 0.75))
+    return {
+        "mean": float(values.mean()),
+        "q25": float(low),
+        "median": float(middle),
+        "q75": float(high),
+        "min": float(values.min()),
+        "max": float(values.max()),
+    }
+
+
+class _Record:
+    """Figures of all replicas, record by record."""
+
+    def __init__(self, groups: list[Group]) -> None:
+        self.groups = groups
+        self.steps: dict[str, list[int]] = {}
+        self.rows: dict[str, list[np.ndarray]] = {}
+        self.alive: dict[str, list[np.ndarray]] = {}
+
+    def add(self, step: int, measured: Mapping[str, np.ndarray], board: Board, alive: np.ndarray | None = None) -> None:
+        for name in QUANTITIES:
+            if name not in measured:
+                continue
+            values = np.asarray(measured[name], dtype=np.float64)
+            good = np.isfinite(values) if alive is None else alive & np.isfinite(values)
+            self.steps.setdefault(name, []).append(step)
+            self.rows.setdefault(name, []).append(values)
+            self.alive.setdefault(name, []).append(good)
+            for group in self.groups[:MOST_LOGGED]:
+                inside = values[group.members][good[group.members]]
+                if inside.size:
+                    found = statistics(inside)
+                    board.scalars({f"{group.name}/{name}_{key}": found[key] for key in LOGGED}, step)
+
+    def statistics(self, group: Group) -> dict[str, Any]:
+        """Of the last record: statistics by quantity, replicas that count."""
+        found: dict[str, Any] = {"replicas": 0}
+        for name, rows in self.rows.items():
+            inside = rows[-1][group.members][self.alive[name][-1][group.members]]
+            found[name] = statistics(inside) if inside.size else None
+            found["replicas"] = max(found["replicas"], int(inside.size))
+        return found
+
+    def curves(self, exact: list[dict[str, float]]) -> dict[str, list[pictures.BandLine]]:
+        """For ``pictures.bands``: quantity with its unit -> a line a group."""
+        shown = {}
+        for name in ("theta", "delta_max", "reward_per_step", "objective", "return"):
+            if name not in self.rows or (name == "return" and "reward_per_step" in self.rows):
+                continue
+            lines = []
+            for group, known in zip(self.groups[:MOST_LOGGED], exact, strict=False):
+                points = [
+                    (step, statistics(row[group.members][good[group.members]]))
+                    for step, row, good in zip(self.steps[name], self.rows[name], self.alive[name], strict=True)
+                    if good[group.members].any()
+                ]
+                steps, found = zip(*points, strict=True) if points else ((), ())
+                lines.append(pictures.BandLine(group.title, steps, found, [known.get(name)] * len(steps)))
+            shown[QUANTITIES[name]] = lines
+        return shown
+
+    def line(self) -> str:
+        """The last record in a line, over all replicas of the first group."""
+        shown = []
+        for name in ("theta", "delta_max", "reward_per_step", "objective"):
+            found = self.statistics(self.groups[0]).get(name)
+            if found:
+                shown.append(f"{name} {found['mean']:.5g} [{found['q25']:.5g}, {found['q75']:.5g}]")
+        more = f"  (first of {len(self.groups)} groups)" if len(self.groups) > 1 else ""
+        return "  ".join(shown) + more
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """``record/NAME`` [n, R] with ``record_step/NAME`` [n]."""
+        found = {f"record/{name}": np.stack(rows) for name, rows in self.rows.items()}
+        return found | {f"record_step/{name}": np.array(steps) for name, steps in self.steps.items()}
+
+
+LOGGED = ("mean", "q25", "q75", "min", "max")
+
+
+def _columns(groups: list[Group]) -> dict[str, np.ndarray]:
+    n = sum(group.members.stop - group.members.start for group in groups)
+    keys = groups[0].settings
+    columns = {f"vary/{key}": np.empty(n) for key in keys}
+    for group in groups:
+        for key, value in group.settings.items():
+            columns[f"vary/{key}"][group.members] = value
+    return columns
+
+
+def _sweep(
+    groups: list[Group], record: _Record, exact: list[dict[str, float]]
+) -> tuple[str, dict[str, list[pictures.BandLine]]]:
+    """The first setting that varies, and quantity with its unit -> a line for each combination of the others."""
+    key = next(iter(groups[0].settings))
+    panels: dict[str, list[pictures.BandLine]] = {}
+    for name in ("theta", "objective", "delta_max"):
+        points: dict[str, list[tuple[float, dict[str, float], float | None]]] = {}
+        for group, known in sorted(zip(groups, exact, strict=True), key=lambda pair: pair[0].settings[key]):
+            found = record.statistics(group).get(name)
+            if found is not None:
+                rest = ", ".join(f"{k} {v:g}" for k, v in group.settings.items() if k != key)
+                points.setdefault(rest, []).append((group.settings[key], found, known.get(name)))
+        if points:
+            panels[QUANTITIES[name]] = [
+                pictures.BandLine(rest, *zip(*row, strict=True)) for rest, row in points.items()
+            ]
+    return key, panels
+
+
+def _summary(cfg: DictConfig, groups: list[Group], result: Mapping[str, Any], directory: Path) -> str:
+    first = f"{cfg.env.name}, {cfg.learner.name}"
+    last_seed = cfg.seed + cfg.n_replicas - 1
+    seeds = f"seed {cfg.seed}" if cfg.n_replicas == 1 else f"seeds {cfg.seed} to {last_seed}"
+    lines = [
+        "",
+        *(_one_group(first, seeds, result) if len(groups) == 1 else _many_groups(first, seeds, groups, result)),
+    ]
+    rate = result["n_tuples"] / max(result["seconds_learning"], 1e-3) / 1e6
+    shown, logs = where(directory)
+    lines += [
+        f"{'tuples streamed':18}{result['n_tuples']:,} ({rate:.3g} M/s)",
+        f"{'seconds':18}{result['seconds']:.1f}, of which {result['seconds_learning']:.1f} learning",
+        f"{'run directory':18}{shown}",
+        f"{'look at it':18}tensorboard --logdir {logs}",
+    ]
+    if result["failures"]:
+        lines.append(f"{'failed':18}{len(result['failures'])} replicas (result.json names them)")
+    return "\n".join(lines)
+
+
+def _one_group(first: str, seeds: str, result: Mapping[str, Any]) -> Iterator[str]:
+    (group,) = result["groups"]
+    yield f"{first}, beta {group['beta']:g}, {result['n_replicas']} replicas ({seeds}): {result['status']}"
+    yield f"{'':18}{'mean':>12}{'quartiles':>26}{'extremes':>26}{'exact':>12}"
+    for name in QUANTITIES:
+        found = group.get(name)
+        if found:
+            quartiles = f"{found['q25']:.5g} to {found['q75']:.5g}"
+            extremes = f"{found['min']:.5g} to {found['max']:.5g}"
+            known = f"{group['exact'][name]:12.6g}" if name in group["exact"] else ""
+            yield f"{name.replace('_', ' '):18}{found['mean']:12.6g}{quartiles:>26}{extremes:>26}{known}"
+
+
+def _many_groups(first: str, seeds: str, groups: list[Group], result: Mapping[str, Any]) -> Iterator[str]:
+    yield f"{first}, {len(groups)} settings, {seeds} each: {result['status']}"
+    width = max(len(group.title) for group in groups) + 2
+    yield f"{'':{width}}{'theta':>11}{'quartiles':>24}{'exact':>11}{'objective':>12}{'at most':>11}"
+    shown = result["groups"] if len(groups) <= 40 else [*result["groups"][:20], None, *result["groups"][-19:]]
+    for found in shown:
+        if found is None:
+            yield "..."
+            continue
+        theta, objective, best = found.get("theta"), found.get("objective"), found["exact"]
+        title = ", ".join(f"{key} {value:g}" for key, value in found["settings"].items())
+        cells = [
+            f"{theta['mean']:.6g}" if theta else "-",
+            f"{theta['q25']:.5g} to {theta['q75']:.5g}" if theta else "-",
+            f"{best['theta']:.6g}" if best else "-",
+            f"{objective['mean']:.6g}" if objective else "-",
+            f"{best['objective']:.6g}" if best else "-",
+        ]
+        widths = (11, 24, 11, 12, 11)
+        yield f"{title:{width}}" + "".join(f"{cell:>{w}}" for cell, w in zip(cells, widths, strict=True))
