@@ -130,8 +130,8 @@ def train_replicas(cfg: DictConfig, directory: Path, safe_point: SafePoint) -> d
                     for state in replicas.iterate(experience, n_states, n_actions):
                         learning += time.perf_counter() - tick
                         metrics = state.metrics()
+                        milestone = _milestone(learner, metrics, history)
                         history.append(metrics)
-                        milestone = _milestone(learner, metrics)
                         bar.update(int(metrics["n_tuples"].sum()) - bar.n)
                         if milestone or len(history) % cfg.evaluation.every == 0:
                             measured = metrics | judge(state.policy.numpy(), bool(milestone))
@@ -341,10 +341,13 @@ def _exact(
     return [known[group.beta] for group in groups]
 
 
-def _milestone(learner: Any, metrics: Mapping[str, np.ndarray]) -> str:
-    if metrics["epoch"].max() < getattr(learner, "n_epochs", 1):
+def _milestone(learner: Any, metrics: Mapping[str, np.ndarray], before: list[dict[str, np.ndarray]]) -> str:
+    """What has come to its end in some replica just now, or nothing."""
+    now = metrics["n_tuples"] > (before[-1]["n_tuples"] if before else 0)
+    ends = now & (metrics["epoch"] >= getattr(learner, "n_epochs", 1))
+    if not ends.any():
         return ""
-    return f"biasing iteration {metrics['bias_iteration'].max()}" if "bias_iteration" in metrics else "last pass"
+    return f"biasing iteration {metrics['bias_iteration'][ends].max()}" if "bias_iteration" in metrics else "last pass"
 
 
 def _status(solution: ReplicaSolution) -> str:

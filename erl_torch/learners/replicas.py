@@ -243,8 +243,8 @@ class Replicas:
             own = state.replica(r)
             rows: list[dict[str, float]] = []
             for row in history:
-                if rows and row["n_tuples"][r] == rows[-1]["n_tuples"]:
-                    break  # stopped before the others
+                if row["n_tuples"][r] == (rows[-1]["n_tuples"] if rows else 0):
+                    break  # it had stopped before
                 rows.append({name: values[r].item() for name, values in row.items()})
             solutions.append(learner.solution(own, rows, state.failures.get(r)))
         return ReplicaSolution(tuple(solutions), state.failures)
