@@ -240,10 +240,12 @@ def _lanes_rows(
     pair, pair_next, factor, noisy, g, z, q, lr_u, lr_rho, inv_rho_min, new, step_k, step_lane, begin, end
 ):  # fmt: skip
     """Rows begin..end of streams [n, lanes], a stream a lane; z [n_pairs * lanes] and q [lanes] change in place."""
+    # Unsigned: Numba would look at the sign of every other index.
+    step_k, step_lane = np.uint64(step_k), np.uint64(step_lane)
     for t in range(begin, end):
         for i in range(q.size):
-            k = pair[t, i] * step_k + i * step_lane
-            j = pair_next[t, i] * step_k + i * step_lane
+            k = np.uint64(pair[t, i]) * step_k + np.uint64(i) * step_lane
+            j = np.uint64(pair_next[t, i]) * step_k + np.uint64(i) * step_lane
             gain = g[k]
             if noisy:
                 gain *= factor[t, i]
@@ -258,11 +260,18 @@ def _shared_rows(pair, pair_next, factor, noisy, g, z, q, lr_u, lr_rho, inv_rho_
         k = pair[t] * lanes
         j = pair_next[t] * lanes
         same = new and k == j
-        for i in range(lanes):
-            gain = g[k + i]
-            if noisy:
-                gain *= factor[t, i]
-            z[k + i], q[i] = _lines_10_and_11(gain, z[k + i], z[j + i], q[i], lr_u[i], lr_rho[i], inv_rho_min[i], same)
+        # Slices, whose indices are plainly in range: the loops become vector instructions.
+        gain, here, there = g[k : k + lanes], z[k : k + lanes], z[j : j + lanes]
+        if noisy:
+            for i in range(lanes):
+                here[i], q[i] = _lines_10_and_11(
+                    gain[i] * factor[t, i], here[i], there[i], q[i], lr_u[i], lr_rho[i], inv_rho_min[i], same
+                )
+        else:
+            for i in range(lanes):
+                here[i], q[i] = _lines_10_and_11(
+                    gain[i], here[i], there[i], q[i], lr_u[i], lr_rho[i], inv_rho_min[i], same
+                )
 
 
 @numba.njit(cache=True, error_model="numpy", nogil=True)
@@ -569,17 +578,18 @@ def _uniforms(state, out, n):
 def _draw_lanes(cdf, low, length, levels, x):
     """``_draw`` in the rows low..low+length of every lane, without branches; low becomes the index drawn.
 
-    ``levels`` halvings, enough for the longest row; length [lanes] is used up.
+    ``levels`` halvings, enough for the longest row; length [lanes] is used up. Both arrays are uint64.
     """
     if low.size < 4:  # too few to hide the latency of so many steps
         for i in range(low.size):
-            low[i] = _draw(cdf, low[i], low[i] + length[i], x[i])
+            low[i] = _draw(cdf, np.int64(low[i]), np.int64(low[i] + length[i]), x[i])
         return
+    none = np.uint64(0)
     for _ in range(levels):
         for i in range(low.size):
-            half = length[i] >> 1
-            # A select. Where half is 0 nothing is added, whatever is read (at index -1, the last).
-            low[i] += half if cdf[low[i] + half - 1] <= x[i] else 0
+            half = length[i] >> np.uint64(1)
+            # A select. Where half is 0, nothing is added, whatever is read.
+            low[i] += half if cdf[low[i] + half - np.uint64(half > none)] <= x[i] else none
             length[i] -= half
 
 
@@ -592,8 +602,8 @@ def sample_rows(
 
     ``entry`` is the index in the CSR transition matrix (s' = indices[entry]); pair_next is s' * A + a'. With
     ``on_prior`` the behaviour policy is the prior and the action taken next is a'; otherwise a' is a draw of its own.
-    ``environment`` and ``behaviour`` [4, lanes] are the generators of each lane, ``now`` [lanes] the pairs that come
-    next, ``done`` the tuples that each stream has had; all but the last move on in place.
+    ``environment`` and ``behaviour`` [4, lanes] are the generators of each lane, ``now`` [lanes] uint64 the pairs that
+    come next, ``done`` the tuples that each stream has had; all but the last move on in place.
     """
     n, lanes = pair.shape
     restarts = (done + n + episode_length - 1) // episode_length - (done + episode_length - 1) // episode_length
@@ -602,8 +612,9 @@ def sample_rows(
     y = np.empty((acts * n + restarts, lanes))
     _uniforms(environment, x, len(x))
     _uniforms(behaviour, y, len(y))
-    low = np.empty(lanes, np.int64)
-    length = np.empty(lanes, np.int64)
+    low = np.empty(lanes, np.uint64)
+    length = np.empty(lanes, np.uint64)
+    per_state = np.uint64(n_actions)
     x_row = 0
     y_row = 0
     for t in range(n):
@@ -617,13 +628,13 @@ def sample_rows(
             k = now[i]
             pair[t, i] = k
             low[i] = indptr[k]
-            length[i] = indptr[k + 1] - indptr[k]
+            length[i] = indptr[k + np.uint64(1)] - indptr[k]
         _draw_lanes(cdf, low, length, levels, x[x_row])
         x_row += 1
         for i in range(lanes):
             entry[t, i] = low[i]
-            low[i] = indices[low[i]] * n_actions
-            length[i] = n_actions
+            low[i] = np.uint64(indices[low[i]]) * per_state
+            length[i] = per_state
         if not on_prior:
             now[:] = low
         _draw_lanes(prior_cdf, low, length, action_levels, y[y_row])
@@ -633,7 +644,7 @@ def sample_rows(
         if on_prior:
             now[:] = low
         else:
-            length[:] = n_actions
+            length[:] = per_state
             _draw_lanes(behaviour_cdf, now, length, action_levels, y[y_row])
             y_row += 1
 

@@ -41,7 +41,7 @@ class Sampler:
         self.n_states, self.n_actions = self.reward.shape
         self.rngs = tuple(rngs)
         self.done = 0  # tuples sampled so far, of each lane
-        self.now = np.zeros(len(self.rngs), np.int64)
+        self.now = np.zeros(len(self.rngs), np.uint64)
         self.environment = _words([rng.environment for rng in self.rngs])
         self.behaviour = _words([rng.behaviour for rng in self.rngs])
         self.tables = (

@@ -72,7 +72,7 @@ def test_blocks_do_not_show(monkeypatch):
     monkeypatch.setattr("erl_torch.experience.BLOCK", 730)
     seen = []
     parts = collect(mdp, 50, 100, 1, report=seen.append)
-    assert seen == [*range(700, 5000, 700), 5000]
+    assert seen == [*range(730, 5000, 730), 5000]
     for name in NAMES:
         assert np.array_equal(getattr(whole, name), getattr(parts, name))
 

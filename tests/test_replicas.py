@@ -1,4 +1,4 @@
-"""Replicas against the same learners alone: bit for bit, whatever the experience, the block, the layout, the threads."""
+"""Replicas against the same learners alone: bit for bit, for any experience, block, layout and number of threads."""
 
 import json
 import re
