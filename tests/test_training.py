@@ -103,6 +103,7 @@ def test_interval_of_the_data(finished):
 @pytest.mark.parametrize("learner", sorted(set(LEARNERS) - {"s1", "exact"}))
 def test_every_learner_runs(tmp_path, learner):
     passes = [] if learner == "certainty_equivalence" else ["learner.n_epochs=2"]
+    passes += ["learner.n_bias=3"] if learner == "s1_efficient" else []
     result = train(composed(f"learner={learner}", "experience.n_episodes=20", *passes), tmp_path)
     reader = events(tmp_path)
     page = (ROOT / "docs" / "logging.md").read_text()
@@ -191,8 +192,8 @@ def test_exact_learner(tmp_path, method):
 
 def test_exact_learner_at_low_temperature_with_positive_rewards(tmp_path):
     """rho = exp(-beta (theta + Delta)) is beyond double precision; the answer is not."""
-    cfg = composed("learner=exact", "learner.method=soft_bellman", "learner.beta=1e4", "env.trap_reward=50")
-    result = train(cfg, tmp_path)
+    overrides = ("learner=exact", "learner.method=soft_bellman", "learner.beta=1e4", "env.trap_reward=50")
+    result = train(composed(*overrides, "evaluation.pictures=false"), tmp_path)
     assert result["status"] == "converged"
     assert result["rho"] is None
     assert result["objective"] == pytest.approx(-result["theta"], abs=1e-6)
@@ -353,7 +354,8 @@ def test_help_is_complete_and_needs_no_torch(tmp_path):
 )
 def test_environments_are_learnt(tmp_path, overrides, better):
     """The learnt policy's return in the environment lies clearly above the prior's."""
-    result = train(composed(*overrides, "experience.n_episodes=200", "evaluation.pictures=false"), tmp_path)
+    small = ("experience.n_episodes=200", "evaluation.every=15", "evaluation.pictures=false")
+    result = train(composed(*overrides, *small), tmp_path)
     returns = [event.value for event in events(tmp_path).Scalars("eval/return")]
     assert result["status"] == "completed"
     assert returns[-1] > returns[0] + better
@@ -392,7 +394,8 @@ def test_wind_fields_come_from_a_file(tmp_path):
 
 def test_exact_return_of_an_episode(tmp_path):
     """FrozenLake's return is the probability of reaching the goal in its 100 steps: against env.step."""
-    result = train(composed("env=frozen_lake", "learner=exact", "learner.beta=200"), tmp_path)
+    overrides = ("env=frozen_lake", "learner=exact", "learner.beta=200", "evaluation.pictures=false")
+    result = train(composed(*overrides), tmp_path)
     policy = Solution.load(tmp_path / "solution.npz").policy.numpy()
     played = evaluate(gym.make("FrozenLake-v1"), policy, 200.0, np.random.default_rng(0), 3000, 100).mean_return
     assert abs(result["return"] - played) < 4.5 * 0.5 / np.sqrt(3000)
@@ -418,7 +421,7 @@ def test_environments_by_id(given, expected):
 def test_control_tasks_are_learnt(tmp_path, monkeypatch, stream):
     """Pendulum on few samples: the learnt policy's return in the original lies far above the prior's."""
     monkeypatch.setenv("ERL_TORCH_CACHE", str(tmp_path / "cache"))
-    small = ("env.n_samples=50", "experience.n_episodes=4000", "evaluation.every=15", "evaluation.pictures=false")
+    small = ("env.n_samples=50", "experience.n_episodes=1000", "evaluation.every=15", "evaluation.pictures=false")
     result = train(composed("env=pendulum", f"env.stream={stream}", *small), tmp_path / "run")
     returns = [event.value for event in events(tmp_path / "run").Scalars("eval/return")]
     assert returns[-1] > returns[0] + 1000
@@ -429,7 +432,7 @@ def test_control_tasks_are_learnt(tmp_path, monkeypatch, stream):
 
 def test_continuous_observations_are_binned(tmp_path):
     common = ("env=gym", "env.id=MountainCar-v0", "experience.n_episodes=20", "evaluation.every=15")
-    result = train(composed(*common, "env.bins=6", "learner.beta=1"), tmp_path / "run")
+    result = train(composed(*common, "env.bins=6", "learner.beta=1", "evaluation.pictures=false"), tmp_path / "run")
     assert Solution.load(tmp_path / "run" / "solution.npz").policy.shape == (36, 3)
     assert result["status"] == "completed"
     with pytest.raises(InputError, match=r"env\.low\[1\]=-?inf: must be finite: dimension 1"):
