@@ -155,7 +155,7 @@ def test_environment_without_a_model(tmp_path):
         composed(
             "env=gym", "env.id=FrozenLake-v1", "++env.kwargs.is_slippery=false", "learner.beta=5",
             "experience.n_episodes=3000", "experience.episode_length=100", "learner.unvisited=prior",
-            "learner.lr_u=0.05", "evaluation.horizon=100", "evaluation.every=15",
+            "learner.lr_u=0.05", "learner.n_bias=2", "evaluation.horizon=100", "evaluation.every=15",
         ),
         tmp_path,
     )  # fmt: skip
@@ -431,8 +431,9 @@ def test_control_tasks_are_learnt(tmp_path, monkeypatch, stream):
 
 
 def test_continuous_observations_are_binned(tmp_path):
-    common = ("env=gym", "env.id=MountainCar-v0", "experience.n_episodes=20", "evaluation.every=15")
-    result = train(composed(*common, "env.bins=6", "learner.beta=1", "evaluation.pictures=false"), tmp_path / "run")
+    small = ("experience.n_episodes=20", "learner.n_bias=2", "evaluation.every=15", "evaluation.pictures=false")
+    overrides = ("env=gym", "env.id=MountainCar-v0", "env.bins=6", "learner.beta=1")
+    result = train(composed(*overrides, *small), tmp_path / "run")
     assert Solution.load(tmp_path / "run" / "solution.npz").policy.shape == (36, 3)
     assert result["status"] == "completed"
     with pytest.raises(InputError, match=r"env\.low\[1\]=-?inf: must be finite: dimension 1"):
