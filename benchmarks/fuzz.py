@@ -34,9 +34,40 @@ from erl_torch.training import train
 ROOT = Path(__file__).parents[1]
 CHEAP = ["experience.n_episodes=2", "experience.episode_length=40", "evaluation.n_episodes=1", "evaluation.horizon=20"]
 ENVS = ["windy_cliff", "windy_frozen_lake", "windy_maze", "dynamics_shift", "frozen_lake", "cliff_walking"]
-NUMBERS = "-1 0 1 2 3 7 0.5 0.1 1e-3 1e-300 1e300 1.5 40 745 1e9 nan inf -inf".split()
-WORDS = "fast literal reset carry new old prior auto on off initial exclude restart absorb biasing nowhere.npz".split()
-OTHERS = ["true", "false", "null", "''", "abc", "[]", "[1,2]", "{}", "cpu", "cuda:9", "holes", "empty"]
+WHOLE = ["-1", "0", "1", "2", "3", "4", "5", "7"]
+NUMBERS = [*WHOLE, "0.5", "0.1", "1e-3", "1e-300", "1e300", "1.5", "40", "745", "1e9", "nan", "inf", "-inf"]
+WORDS = [
+    "fast",
+    "literal",
+    "reset",
+    "carry",
+    "new",
+    "old",
+    "prior",
+    "auto",
+    "on",
+    "off",
+    "initial",
+    "exclude",
+    "biasing",
+]
+OTHERS = [
+    "true",
+    "false",
+    "null",
+    "''",
+    "abc",
+    "[]",
+    "[1,2]",
+    "{}",
+    "cpu",
+    "cuda:9",
+    "holes",
+    "empty",
+    "nowhere.npz",
+    "restart",
+    "absorb",
+]
 FIXED = ("name", "id", "suggest", "experience.save_to", "env.size", "env.n_actions", "threads")  # costs, or other runs
 
 
@@ -46,7 +77,7 @@ def keys(learner: str, env: str) -> dict[str, list[str]]:
     found = {key: cfg[key] for key in ("seed", "n_replicas", "checkpoint_every", "shared_stream", "keep_tuples")}
     for group in ("learner", "env", "experience", "evaluation"):
         found |= {f"{group}.{key}": cfg[group][key] for key in map(str, cfg[group])}
-    kinds = {bool: ["true", "false"], int: NUMBERS, float: NUMBERS, str: WORDS}
+    kinds = {bool: ["true", "false"], int: WHOLE, float: NUMBERS, str: WORDS}
     usable = {key: value for key, value in found.items() if key.split(".")[-1] not in FIXED and key not in FIXED}
     return {key: kinds.get(type(value), NUMBERS + WORDS + OTHERS) for key, value in usable.items()}
 
@@ -65,7 +96,7 @@ def configurations(n: int = 10_000, seed: int = 0) -> None:
             if (learner, env) not in known:
                 known[learner, env] = keys(learner, env)
             of_kind = known[learner, env]
-            changed = rng.choice(sorted(of_kind), size=int(rng.integers(1, 4)), replace=False)
+            changed = rng.choice(sorted(of_kind), size=int(rng.integers(1, 3)), replace=False)
             overrides = [f"learner={learner}", f"env={env}", *CHEAP, "evaluation.pictures=false"]
             every = NUMBERS + WORDS + OTHERS
             overrides += [f"{key}={rng.choice(of_kind[key] if rng.random() < 0.8 else every)}" for key in changed]
