@@ -8,8 +8,9 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
-from torch.utils.tensorboard import SummaryWriter
-from torch.utils.tensorboard.summary import hparams
+from torch.utils.tensorboard import summary
+
+from erl_torch.event_file import EventFile
 
 RETURNS = {
     "Returns": {
@@ -61,29 +62,45 @@ def replica_layout(groups: Sequence[str]) -> dict[str, Any]:
 
 
 class Board:
-    """Writes records against tuples streamed. A context manager: what was logged survives an exception."""
+    """Writes records against tuples streamed. A context manager: what was logged survives an exception.
+
+    Args:
+        directory: the run's.
+        hyperparameters: numbers, booleans and text.
+        layout: of the Custom Scalars tab.
+        size: of the event file at the checkpoint that the run goes on from; 0 begins it.
+    """
 
     def __init__(
-        self, directory: str | os.PathLike[str], hyperparameters: Mapping[str, Any], layout: Mapping[str, Any]
+        self,
+        directory: str | os.PathLike[str],
+        hyperparameters: Mapping[str, Any],
+        layout: Mapping[str, Any],
+        size: int = 0,
     ) -> None:
-        self._writer = SummaryWriter(str(directory))
-        self._writer.add_custom_scalars(layout)
+        self._file = EventFile(directory, size)
         # Session start and end go into the run's own file: add_hparams would open a run directory more.
         # No experiment summary: TensorBoard takes the first it finds and hides other runs' columns.
-        _, self._session_start, self._session_end = hparams(dict(hyperparameters), {})  # type: ignore[no-untyped-call]
-        self._summary(self._session_start)
+        _, session_start, self._session_end = summary.hparams(dict(hyperparameters), {})  # type: ignore[no-untyped-call]
+        if not size:
+            self._file.add(summary.custom_scalars(layout))  # type: ignore[no-untyped-call]
+            self._file.add(session_start)
 
     def scalars(self, values: Mapping[str, float], step: int) -> None:
         """One record; keys are full tags."""
         for tag, value in values.items():
-            self._writer.add_scalar(tag, value, step)
+            self._file.add(summary.scalar(tag, value), step)  # type: ignore[no-untyped-call]
 
     def picture(self, tag: str, pixels: np.ndarray, step: int) -> None:
         """An image [H, W, 3] uint8."""
-        self._writer.add_image(tag, pixels, step, dataformats="HWC")
+        self._file.add(summary.image(tag, pixels, dataformats="HWC"), step)  # type: ignore[no-untyped-call]
 
     def text(self, tag: str, markdown: str) -> None:
-        self._writer.add_text(tag, markdown)
+        self._file.add(summary.text(tag, markdown))  # type: ignore[no-untyped-call]
+
+    def flush(self) -> int:
+        """Hand all records to the system; the size of the event file."""
+        return self._file.flush()
 
     def __enter__(self) -> Board:
         return self
@@ -91,8 +108,5 @@ class Board:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._summary(self._session_end)
-        self._writer.close()
-
-    def _summary(self, summary: Any) -> None:
-        self._writer._get_file_writer().add_summary(summary)  # type: ignore[no-untyped-call]
+        self._file.add(self._session_end)
+        self._file.close()

@@ -150,7 +150,10 @@ def run(main: Callable[[], Any], about: str, conf: Path, config_name: str) -> No
 
     With HYDRA_FULL_ERROR=1 in the environment every traceback is shown.
     """
-    arguments = sys.argv[1:]
+    try:
+        arguments = _resumed(sys.argv[1:])
+    except InputError as error:
+        raise SystemExit(_report(error)) from None
     # Keys that no schema lists need Hydra's "++"; the user need not know.
     arguments = [f"++{a}" if a.startswith(OPEN_NODES) else a for a in arguments]
     arguments = [b for a in arguments for b in _by_id(a, conf)]
@@ -176,6 +179,20 @@ def run(main: Callable[[], Any], about: str, conf: Path, config_name: str) -> No
         raise SystemExit(_report(error)) from None
     if sweeps.failures(rows):
         raise SystemExit(1)
+
+
+def _resumed(arguments: list[str]) -> list[str]:
+    """resume=RUN_DIR in full: the arguments that the run began with, and its directory."""
+    given = [a for a in arguments if a.startswith("resume=")]
+    if not given:
+        return arguments
+    directory = Path(given[-1].removeprefix("resume="))
+    try:
+        began: Any = OmegaConf.to_container(OmegaConf.load(directory / ".hydra" / "overrides.yaml"))
+    except OSError as error:
+        raise InputError("resume", directory, f"a run directory ({error.strerror}: {error.filename})") from error
+    others = [a for a in arguments if a not in given]
+    return [*began, *others, "hydra.run.dir='{}'".format(str(directory).replace("'", "\\'"))]
 
 
 def _by_id(argument: str, conf: Path) -> list[str]:

@@ -278,6 +278,7 @@ class Train:
     shared_stream: bool = False
     keep_tuples: bool | None = None
     threads: int | None = None
+    checkpoint_every: float | None = 60.0
     env: Any = MISSING
     learner: Any = MISSING
     experience: Any = MISSING

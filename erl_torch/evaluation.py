@@ -107,9 +107,9 @@ def induced_distribution(mdp: TabularMDP, policy: np.ndarray, horizon: int | Non
     chain = policy_chain(mdp, policy).transition
     if horizon is None:
         return stationary_distribution(chain, mdp.start)
-    share, now = np.zeros(mdp.n_states), mdp.start
+    share, now, backward = np.zeros(mdp.n_states), mdp.start, sp.csr_array(chain.T)
     for _ in range(horizon):
-        share, now = share + now, chain.T @ now
+        share, now = share + now, backward @ now
     return share / horizon
 
 

@@ -46,14 +46,18 @@ def write_npz(path: str | os.PathLike[str], arrays: Mapping[str, Any]) -> Path:
     return _write(path, fill)
 
 
-def write_json(path: str | os.PathLike[str], value: Mapping[str, Any]) -> Path:
-    """Write JSON (no NaN or infinity)."""
-    text = json.dumps(value, indent=2, allow_nan=False) + "\n"
+def write_bytes(path: str | os.PathLike[str], content: bytes) -> Path:
+    """Write ``content`` as it is."""
 
     def fill(file: BinaryIO) -> None:
-        file.write(text.encode())
+        file.write(content)
 
     return _write(path, fill)
+
+
+def write_json(path: str | os.PathLike[str], value: Mapping[str, Any]) -> Path:
+    """Write JSON (no NaN or infinity)."""
+    return write_bytes(path, (json.dumps(value, indent=2, allow_nan=False) + "\n").encode())
 
 
 def write_png(path: str | os.PathLike[str], pixels: np.ndarray) -> Path:

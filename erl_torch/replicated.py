@@ -14,7 +14,7 @@ import itertools
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,12 +27,13 @@ from tqdm import tqdm
 
 from erl_torch import checks, pictures
 from erl_torch.board import Board, replica_layout
+from erl_torch.checkpoint import Checkpoints, digest
 from erl_torch.checks import InputError
 from erl_torch.evaluation import Judge, evaluate
 from erl_torch.experience import collect
 from erl_torch.files import read_npy, write_json, write_png
 from erl_torch.learners import Exact, NonFiniteError
-from erl_torch.learners.replicas import Experience, Replicas, ReplicaSolution, ReplicaState, Simulation
+from erl_torch.learners.replicas import Experience, Replicas, ReplicaSolution, Simulation
 from erl_torch.mdp import TabularMDP
 from erl_torch.models import known_mdp, sizes
 from erl_torch.rng import streams
@@ -42,6 +43,7 @@ from erl_torch.training import (
     SMALL,
     SafePoint,
     World,
+    flat,
     learning_bar,
     make_env,
     make_learner,
@@ -82,7 +84,7 @@ class Group:
         return ", ".join(f"{key} {value:g}" for key, value in self.settings.items())
 
 
-def train_replicas(cfg: DictConfig, directory: Path, safe_point: SafePoint) -> dict[str, Any]:
+def train_replicas(cfg: DictConfig, directory: Path, safe_point: SafePoint, saved: Checkpoints) -> dict[str, Any]:
     """Run ``cfg``, which ``erl_torch.training.train`` has checked; returns what ``result.json`` holds.
 
     Raises:
@@ -109,25 +111,47 @@ def train_replicas(cfg: DictConfig, directory: Path, safe_point: SafePoint) -> d
         n_experience = max(_lengths(experience))
         judge = _Judges(cfg, env, world, prior, [one.beta for one in learners], seeds, threads)
 
+        stream = None if isinstance(experience, Simulation) else [digest(data) for data in _recorded(experience)]
+        found = saved.start()
+        if found and found["digest"] != stream:
+            raise InputError("experience", "another stream", "the one that the run in its directory began with")
         record = _Record(groups)
         stopped: BaseException | None = None
-        state: ReplicaState | None = None
+        state: Any = None
         history: list[dict[str, np.ndarray]] = []
         learning = 0.0
-        settings = {
-            **cfg.learner,
-            **{f"vary.{k}": v for k, v in _plain(cfg.vary).items()},
-            "n_replicas": cfg.n_replicas,
-        }
-        hyperparameters = {k: v if isinstance(v, (bool, int, float, str)) else str(v) for k, v in settings.items()}
-        with Board(directory, hyperparameters, replica_layout([g.name for g in groups[:MOST_LOGGED]])) as board:
-            board.text("configuration", f"```yaml\n{OmegaConf.to_yaml(cfg, resolve=True)}```")
-            record.add(0, judge(np.repeat(prior[None], len(replicas), axis=0), True), board)
+        varied = {f"vary.{key}": values for key, values in _plain(cfg.vary).items()}
+        settings = flat({**cfg.learner, **varied, "seed": cfg.seed, "n_replicas": cfg.n_replicas})
+        layout = replica_layout([g.name for g in groups[:MOST_LOGGED]])
+        with Board(directory, settings, layout, found["events"] if found else 0) as board:
+            if found:
+                state, history, learning = found["state"], found["history"], found["learning"]
+                record.steps, record.rows, record.alive = found["record"]
+                judge.restore(found["evaluation"])
+                began -= found["seconds"]
+            else:
+                board.text("configuration", f"```yaml\n{OmegaConf.to_yaml(cfg, resolve=True)}```")
+                record.add(0, judge(np.repeat(prior[None], len(replicas), axis=0), True), board)
+
+            def snapshot() -> dict[str, Any]:
+                return {
+                    "state": state,
+                    "history": history,
+                    "record": (record.steps, record.rows, record.alive),
+                    "evaluation": judge.generators(),
+                    "events": board.flush(),
+                    "learning": learning,
+                    "seconds": time.perf_counter() - began,
+                    "digest": stream,
+                }
+
             passes = getattr(learner, "n_bias", 1) * getattr(learner, "n_epochs", 1)
             try:
                 with learning_bar(passes * n_experience * len(replicas), "tuples") as bar:
+                    bar.update(int(history[-1]["n_tuples"].sum()) if history else 0)
                     tick = time.perf_counter()
-                    for state in replicas.iterate(experience, n_states, n_actions):
+                    goes_on_from = state
+                    for state in replicas.iterate(experience, n_states, n_actions, goes_on_from):
                         learning += time.perf_counter() - tick
                         metrics = state.metrics()
                         milestone = _milestone(learner, metrics, history)
@@ -139,10 +163,13 @@ def train_replicas(cfg: DictConfig, directory: Path, safe_point: SafePoint) -> d
                             record.add(state.n_tuples, measured, board, alive)
                             if milestone:
                                 tqdm.write(f"{milestone}: {record.line()}", file=sys.stderr)
+                        saved.offer(state.n_tuples, snapshot)
                         safe_point()
                         tick = time.perf_counter()
             except (KeyboardInterrupt, SystemExit) as error:
                 stopped = error
+                if history:
+                    saved.offer(state.n_tuples, snapshot, now=True)
             if state is None:
                 assert stopped is not None
                 raise stopped
@@ -189,6 +216,7 @@ def train_replicas(cfg: DictConfig, directory: Path, safe_point: SafePoint) -> d
     print(_summary(cfg, groups, result, directory))
     if stopped is not None:
         raise stopped
+    saved.clear()
     if solution.failures:
         raise _as_one(solution.failures, seeds, learners)
     return result
@@ -262,10 +290,14 @@ def _experience(
     return [made[seed] for seed in seeds]
 
 
+def _recorded(experience: Transitions | Sequence[Transitions]) -> Sequence[Transitions]:
+    return [experience] if isinstance(experience, Transitions) else experience
+
+
 def _lengths(experience: Experience) -> list[int]:
     if isinstance(experience, Simulation):
         return [experience.n_tuples]
-    return [len(data) for data in ([experience] if isinstance(experience, Transitions) else experience)]
+    return [len(data) for data in _recorded(experience)]
 
 
 class _Judges:
@@ -293,6 +325,15 @@ class _Judges:
         # An episode's return is the model's where the environment is the model.
         endless = known_mdp(env) is not None and not getattr(env.unwrapped, "ends", np.zeros(1)).any()
         self.episode = world.episode or (world.mdp if endless else None)
+
+    def generators(self) -> list[Any]:
+        """States of the generators that play episodes."""
+        return [rng.bit_generator.state for rng in self.rngs]
+
+    def restore(self, states: list[Any]) -> None:
+        """Set the generators to ``states``."""
+        for rng, state in zip(self.rngs, states, strict=True):
+            rng.bit_generator.state = state
 
     def __call__(self, policies: np.ndarray, milestone: bool) -> dict[str, np.ndarray]:
         """Figures of policies [R, S, A], [R] each."""

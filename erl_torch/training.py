@@ -26,6 +26,7 @@ import erl_torch
 from erl_torch import checks, kernels, pictures
 from erl_torch.board import EXACT_LAYOUT, LEARNER_LAYOUT, S1_LAYOUT, Board
 from erl_torch.chains import SingularChainError
+from erl_torch.checkpoint import Checkpoints, digest
 from erl_torch.checks import InputError
 from erl_torch.config import check_keys
 from erl_torch.empirical import empirical_mdp
@@ -66,15 +67,23 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
     checks.at_least("n_replicas", cfg.n_replicas, 1)
     if cfg.threads is not None:
         checks.at_least("threads", cfg.threads, 1)
+    if cfg.checkpoint_every is not None and not cfg.checkpoint_every >= 0:
+        raise InputError("checkpoint_every", cfg.checkpoint_every, "seconds >= 0, or null")
     many = cfg.n_replicas > 1 or cfg.vary
     torch.set_num_threads(1 if many else cfg.threads or 1)
     if not kernels.compiled_before():
         print("compiling the loops, about ten seconds: on the first run only", file=sys.stderr)
     _check_evaluation(cfg.evaluation)
+    settings: Any = OmegaConf.to_container(cfg, resolve=True)
+    saved = Checkpoints(directory, settings, cfg.checkpoint_every, "cpu" if many else cfg.learner.get("device", "cpu"))
+    if (result := saved.result()) is not None:
+        print(f"note: the run in {directory} is complete", file=sys.stderr)
+        saved.clear()
+        return result
     if many:
         from erl_torch.replicated import train_replicas
 
-        return train_replicas(cfg, directory, safe_point)
+        return train_replicas(cfg, directory, safe_point, saved)
     for key in ("shared_stream", "keep_tuples"):
         if cfg[key]:
             raise InputError(key, cfg[key], "left out, or used with n_replicas > 1 or vary.KEY=[...]")
@@ -97,22 +106,44 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
             exact = None if world.episode is None else functools.partial(_mean_return, world.episode, horizon)
             return evaluate(env, policy, learner.beta, rng.evaluation, e.n_episodes, horizon, prior, judge, exact)
 
+        found = run.check(saved.start())
         start = state = learner.init(n_states, n_actions)
         history: list[dict[str, float]] = []
         stopped: BaseException | None = None
         clock = _Stopwatch()
         hyperparameters = flat({**cfg.learner, "seed": cfg.seed, "n_experience": run.n_experience})
-        with Board(directory, hyperparameters, run.layout) as board:
-            board.text("configuration", f"```yaml\n{OmegaConf.to_yaml(cfg, resolve=True)}```")
-            first = last = measure(state.policy)
-            board.scalars(run.tags(state, first), 0)
+        with Board(directory, hyperparameters, run.layout, found["events"] if found else 0) as board:
             drawer = _Drawer(board, getattr(env.unwrapped, "grid", None)) if cfg.evaluation.pictures else None
-            if drawer:
-                drawer.policy(state, 0, "prior policy")
+            if found:
+                state, history, first, last = (found[key] for key in ("state", "history", "first", "last"))
+                rng.evaluation.bit_generator.state = found["evaluation"]
+                clock.seconds, began = found["learning"], began - found["seconds"]
+            else:
+                board.text("configuration", f"```yaml\n{OmegaConf.to_yaml(cfg, resolve=True)}```")
+                first = last = measure(state.policy)
+                board.scalars(run.tags(state, first), 0)
+                if drawer:
+                    drawer.policy(state, 0, "prior policy")
+
+            def snapshot() -> dict[str, Any]:
+                return {
+                    "state": state,
+                    "history": history,
+                    "first": first,
+                    "last": last,
+                    "evaluation": rng.evaluation.bit_generator.state,
+                    "events": board.flush(),
+                    "learning": clock.seconds,
+                    "seconds": time.perf_counter() - began,
+                    "digest": run.digest,
+                }
+
             # Whatever ends the loop, what was learnt until then is written below.
             try:
                 with run.bar() as bar:
-                    for state in clock.time(run.states()):
+                    bar.update(run.step(state))
+                    goes_on_from = state if found else None
+                    for state in clock.time(run.states(goes_on_from)):
                         history.append(state.metrics())
                         step, milestone = run.step(state), run.milestone(state)
                         if milestone or len(history) % cfg.evaluation.every == 0:
@@ -126,9 +157,13 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
                         bar.update(step - bar.n)
                         if milestone:
                             _say(milestone, state, last)
+                        if run.digest is not None:
+                            saved.offer(step, snapshot)
                         safe_point()
             except (NonFiniteError, KeyboardInterrupt, SystemExit) as error:
                 stopped = error
+                if run.digest is not None and history and not isinstance(error, NonFiniteError):
+                    saved.offer(run.step(state), snapshot, now=True)
             solution = run.solution(state, history, stopped)
             if judge is not None and solution.theta_bounds is None and cfg.evaluation.certify:
                 solution = certify(solution, judge, learner.beta, prior)
@@ -148,6 +183,7 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
     print(_summary(cfg, first, last, start, result, directory, run.unit))
     if stopped is not None:
         raise stopped
+    saved.clear()
     return result
 
 
@@ -178,10 +214,17 @@ class _Learning:
         self.sizes = sizes(world.source)
         self.data = _experience(cfg.experience, world.source, *self.sizes, rng, prior, safe_point)
         self.n_experience = len(self.data)
+        self.digest: int | None = digest(self.data)
         safe_point()
 
-    def states(self) -> Iterator[Any]:
-        yield from self.learner.iterate(self.data, *self.sizes)
+    def check(self, found: dict[str, Any] | None) -> dict[str, Any] | None:
+        """A checkpoint, if it is of this stream. Raises InputError."""
+        if found and found["digest"] != self.digest:
+            raise InputError("experience", "another stream", "the one that the run in its directory began with")
+        return found
+
+    def states(self, state: Any) -> Iterator[Any]:
+        yield from self.learner.iterate(self.data, *self.sizes, state)
 
     def step(self, state: Any) -> int:
         return int(state.n_tuples)
@@ -225,6 +268,7 @@ class _Solving:
     unit = "iterations"
     layout = EXACT_LAYOUT
     n_experience = 0
+    digest = None  # no stream, and no checkpoints: it begins anew
 
     def __init__(
         self,
@@ -241,7 +285,10 @@ class _Solving:
             )
         self.learner, self.mdp = learner, world.mdp
 
-    def states(self) -> Iterator[ExactState]:
+    def check(self, found: dict[str, Any] | None) -> None:
+        return None
+
+    def states(self, state: None) -> Iterator[ExactState]:
         return self.learner.iterate(self.mdp)
 
     def step(self, state: ExactState) -> int:

@@ -1,5 +1,7 @@
 """Shared problems: small random MDPs, exhaustive streams, the authors' data."""
 
+import runpy
+import sys
 from pathlib import Path
 
 import hypothesis
@@ -14,6 +16,7 @@ from erl_torch import TabularMDP, Transitions
 hypothesis.settings.register_profile("erl_torch", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("erl_torch")
 
+ROOT = Path(__file__).parents[1]
 DATA = Path(__file__).parent / "data"
 
 
@@ -27,6 +30,24 @@ def authors():
 @pytest.fixture(scope="session")
 def authors_tuples(authors):
     return Transitions(*(authors[name] for name in ("s", "a", "r", "s_next", "a_next")))
+
+
+@pytest.fixture
+def typed_here(tmp_path, monkeypatch, capsys):
+    """A script run from ``tmp_path`` in this process, torch being imported already: (exit code, stdout, stderr)."""
+
+    def call(script, *arguments):
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(sys, "argv", [script, *arguments])
+        monkeypatch.setenv("HYDRA_FULL_ERROR", "")
+        code = 0
+        try:
+            runpy.run_path(str(ROOT / script), run_name="__main__")
+        except SystemExit as end:
+            code = end.code
+        return code, *capsys.readouterr()
+
+    return call
 
 
 def random_mdp(rng: np.random.Generator, n_states: int, n_actions: int) -> TabularMDP:

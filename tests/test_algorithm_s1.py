@@ -96,10 +96,10 @@ def test_fast_is_the_listing(problem, noisy, shift, **options):
         np.testing.assert_allclose(getattr(fast, name), getattr(literal, name), rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("options", [{}, {"rho_init": "carry", "self_loop": "old"}])
-def test_fast_is_the_listing_on_the_cliff(authors_tuples, options):
+def test_fast_is_the_listing_on_the_cliff(authors_tuples):
+    """The other options are the authors' own, above."""
     fast, literal = (
-        AlgorithmS1(n_epochs=2, n_bias=3, implementation=i, **options).fit(authors_tuples, 15, 4)
+        AlgorithmS1(n_epochs=2, n_bias=3, implementation=i).fit(authors_tuples.first(10_000), 15, 4)
         for i in IMPLEMENTATIONS
     )
     assert fast.theta == pytest.approx(literal.theta, abs=1e-9)

@@ -4,11 +4,10 @@ import json
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import random_mdp, random_policy
+from conftest import ROOT, random_mdp, random_policy
 from hydra import compose, initialize_config_dir
 from matplotlib.image import imread
 
@@ -18,7 +17,6 @@ from erl_torch.comparison import MEASURES, compare, interquartile_mean, measure,
 from erl_torch.evaluation import induced_distribution, objective
 from erl_torch.learners import LEARNERS, DifferentialSoftQ, SoftQ
 
-ROOT = Path(__file__).parents[1]
 SMALL = ("experience.n_episodes=4", "experience.episode_length=500", "seeds=2", "n_sizes=2")
 PAIR = "learners=[differential_soft_q,soft_q]"
 config.register()
@@ -243,13 +241,10 @@ def test_recorded_experience_is_refused(tmp_path):
 
 
 def test_command_line(tmp_path):
-    def run(*arguments):
-        return subprocess.run(
-            [sys.executable, str(ROOT / "compare.py"), *arguments],
-            cwd=tmp_path, capture_output=True, text=True, timeout=120, env={**os.environ, "PYTHONPATH": str(ROOT)},
-        )  # fmt: skip
-
-    done = run(*SMALL, PAIR, "n_sizes=1")
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "compare.py"), *SMALL, PAIR, "n_sizes=1"],
+        cwd=tmp_path, capture_output=True, text=True, timeout=120, env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
     assert done.returncode == 0, done.stderr
     (directory,) = (tmp_path / "runs" / "windy_cliff").iterdir()
     assert directory.name.startswith("compare-")
@@ -261,13 +256,16 @@ def test_command_line(tmp_path):
         assert float(row[1]) == pytest.approx(result["table"][row[0]]["gap"]["mean"], rel=1e-2)
     assert [float(row[2]) for row in rows] == sorted(float(row[2]) for row in rows)
     assert lines[-1].endswith(f"runs/windy_cliff/{directory.name}")
-    failed = run("learners=[s4]")
-    assert failed.returncode == 1
-    assert failed.stderr.startswith("error: learners=s4: must be")
-    assert failed.stderr.count("\n") == 1
-    about = run("--help")
-    assert "windy_cliff,windy_frozen_lake" in about.stdout
-    assert "learner={" not in about.stdout
+
+
+def test_errors_and_help(typed_here):
+    code, _, err = typed_here("compare.py", "learners=[s4]")
+    assert code == 1
+    assert err.startswith("error: learners=s4: must be")
+    assert err.count("\n") == 1
+    _, about, _ = typed_here("compare.py", "--help")
+    assert "windy_cliff,windy_frozen_lake" in about
+    assert "learner={" not in about
 
 
 # -- the picture ------------------------------------------------------------------------------------------

@@ -1,18 +1,18 @@
 """Whole runs: what a run directory holds, what is logged, and that bits repeat."""
 
+import contextlib
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from conftest import random_mdp
+from conftest import ROOT, random_mdp
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from test_config import composed
 
@@ -20,15 +20,7 @@ from erl_torch import InputError, Solution, Status, Transitions, cli, evaluate
 from erl_torch.learners import LEARNERS
 from erl_torch.training import train
 
-ROOT = Path(__file__).parents[1]
 SMALL = ("experience.n_episodes=20", "learner.n_epochs=2", "learner.n_bias=3")
-
-
-def run(*arguments, cwd, **options):
-    return subprocess.run(
-        [sys.executable, str(ROOT / "train.py"), *arguments],
-        cwd=cwd, capture_output=True, text=True, timeout=120, **options,
-    )  # fmt: skip
 
 
 def events(directory):
@@ -111,6 +103,7 @@ def test_interval_of_the_data(finished):
 @pytest.mark.parametrize("learner", sorted(set(LEARNERS) - {"s1", "exact"}))
 def test_every_learner_runs(tmp_path, learner):
     passes = [] if learner == "certainty_equivalence" else ["learner.n_epochs=2"]
+    passes += ["learner.n_bias=3"] if learner == "s1_efficient" else []
     result = train(composed(f"learner={learner}", "experience.n_episodes=20", *passes), tmp_path)
     reader = events(tmp_path)
     page = (ROOT / "docs" / "logging.md").read_text()
@@ -162,7 +155,7 @@ def test_environment_without_a_model(tmp_path):
         composed(
             "env=gym", "env.id=FrozenLake-v1", "++env.kwargs.is_slippery=false", "learner.beta=5",
             "experience.n_episodes=3000", "experience.episode_length=100", "learner.unvisited=prior",
-            "learner.lr_u=0.05", "evaluation.horizon=100", "evaluation.every=15",
+            "learner.lr_u=0.05", "learner.n_bias=2", "evaluation.horizon=100", "evaluation.every=15",
         ),
         tmp_path,
     )  # fmt: skip
@@ -199,8 +192,8 @@ def test_exact_learner(tmp_path, method):
 
 def test_exact_learner_at_low_temperature_with_positive_rewards(tmp_path):
     """rho = exp(-beta (theta + Delta)) is beyond double precision; the answer is not."""
-    cfg = composed("learner=exact", "learner.method=soft_bellman", "learner.beta=1e4", "env.trap_reward=50")
-    result = train(cfg, tmp_path)
+    overrides = ("learner=exact", "learner.method=soft_bellman", "learner.beta=1e4", "env.trap_reward=50")
+    result = train(composed(*overrides, "evaluation.pictures=false"), tmp_path)
     assert result["status"] == "converged"
     assert result["rho"] is None
     assert result["objective"] == pytest.approx(-result["theta"], abs=1e-6)
@@ -227,51 +220,71 @@ def test_failure_keeps_what_was_learnt(tmp_path):
 # -- the command line, as typed ---------------------------------------------------------------------------
 
 
-def test_command_line_run(tmp_path):
-    done = run("env=windy_cliff", *SMALL, "evaluation.pictures=false", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    (directory,) = (tmp_path / "runs" / "windy_cliff").iterdir()
+@pytest.fixture(scope="module")
+def typed(tmp_path_factory):
+    """(process, its directory) of each command below; started together, they share the cores."""
+    endless = ("learner.n_epochs=100000", "evaluation.pictures=false")
+    commands = {
+        signal.SIGTERM: endless,
+        signal.SIGINT: endless,
+        "sweep": ("-m", "learner.beta=2,-1,5", "seed=0,1", *SMALL, "evaluation.pictures=false"),
+        "run": ("env=windy_cliff", *SMALL, "evaluation.pictures=false"),
+        "error": ("learner.beta=two",),
+    }
+    with contextlib.ExitStack() as stack:
+        started = {}
+        for name, arguments in commands.items():
+            directory = tmp_path_factory.mktemp("typed")
+            process = subprocess.Popen(
+                [sys.executable, str(ROOT / "train.py"), *arguments],
+                cwd=directory, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+            )  # fmt: skip
+            stack.enter_context(process)
+            stack.callback(process.kill)
+            started[name] = process, directory
+        yield started
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_termination_keeps_what_was_learnt(typed, number):
+    process, cwd = typed[number]
+    deadline = time.monotonic() + 120
+    while time.monotonic() < deadline and not list(cwd.rglob("events.*")):
+        time.sleep(0.05)
+    time.sleep(0.5)  # well inside the epochs
+    process.send_signal(number)
+    out, _ = process.communicate(timeout=60)
+    assert process.returncode == 128 + number
+    assert "stopped by the caller" in out
+    (directory,) = (cwd / "runs" / "windy_cliff").iterdir()
+    result = json.loads((directory / "result.json").read_text())
+    assert result["status"] == "stopped"
+    assert result["n_tuples"] > 0
+    logged = events(directory).Scalars("s1/theta")
+    assert logged[-1].step == result["n_tuples"]
+    assert logged[-1].value == pytest.approx(result["theta"], rel=1e-6)
+
+
+def test_command_line_run(typed):
+    process, cwd = typed["run"]
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == 0, err
+    (directory,) = (cwd / "runs" / "windy_cliff").iterdir()
     assert {".hydra", "result.json", "solution.npz"} < {p.name for p in directory.iterdir()}
-    assert f"runs/windy_cliff/{directory.name}" in done.stdout
-    assert "tensorboard --logdir runs" in done.stdout
+    assert f"runs/windy_cliff/{directory.name}" in out
+    assert "tensorboard --logdir runs" in out
     # In a pipe: a line a biasing iteration, and no bar.
-    lines = done.stderr.splitlines()
+    lines = err.splitlines()
     assert [line.split(":")[0] for line in lines] == [f"biasing iteration {k}" for k in range(3)]
-    assert "\r" not in done.stderr
+    assert "\r" not in err
 
 
-def test_command_line_errors(tmp_path):
-    for arguments, code, start in [
-        (["learner.beta=-1"], 1, "error: learner.beta=-1.0: must be a finite number > 0"),
-        (["+learner.betta=2"], 1, "error: learner.betta=2: must be left out: no such key; there are"),
-        (["learner.beta=two"], 1, "error: learner.beta=two: Value 'two'"),
-        (["beta"], 2, "error: beta: not of the form key=value"),
-        (["hydra.run.dir=/dev/null/here"], 1, "error: /dev/null/here: Not a directory"),
-    ]:
-        done = run(*arguments, cwd=tmp_path)
-        assert done.returncode == code
-        assert done.stderr.startswith(start)
-        assert done.stderr.count("\n") == 1
-        assert done.stdout == ""
-    assert not list((tmp_path / "runs").iterdir())
-
-
-def test_help_is_complete_and_needs_no_torch(tmp_path):
-    done = run("--help", cwd=tmp_path, env={**os.environ, "PYTHONPROFILEIMPORTTIME": "1"})
-    assert done.returncode == 0
-    for text in ("python train.py env=windy_cliff", "windy_cliff,windy_frozen_lake", "lr_psi: 0.1", "conf/"):
-        assert text in done.stdout
-    assert " gymnasium\n" in done.stderr
-    for module in (" torch\n", " numba\n", " scipy\n", " matplotlib\n"):
-        assert module not in done.stderr
-    assert not (tmp_path / "runs").exists()
-
-
-def test_multirun_writes_one_named_directory_a_job(tmp_path):
+def test_multirun_writes_one_named_directory_a_job(typed):
     """The job that cannot run says so and leaves nothing; the others finish."""
-    done = run("-m", "learner.beta=2,-1,5", "seed=0,1", *SMALL, "evaluation.pictures=false", cwd=tmp_path)
-    assert done.returncode == 1
-    (sweep,) = (tmp_path / "runs" / "windy_cliff").iterdir()
+    process, cwd = typed["sweep"]
+    _, err = process.communicate(timeout=120)
+    assert process.returncode == 1
+    (sweep,) = (cwd / "runs" / "windy_cliff").iterdir()
     assert sweep.name.startswith("sweep-")
     names = [p.name.split("-pictures")[0] for p in sorted(sweep.iterdir()) if p.is_dir()]
     assert [n[:3] for n in names] == ["000", "001", "004", "005"]
@@ -280,30 +293,50 @@ def test_multirun_writes_one_named_directory_a_job(tmp_path):
             result = json.loads((directory / "result.json").read_text())
             assert f"beta={result['beta']:g}-" in directory.name
             assert directory.name.endswith(f"-seed={result['seed']}")
-    assert done.stderr.count("learner.beta=-1.0: must be a finite number > 0") == 2
+    assert err.count("learner.beta=-1.0: must be a finite number > 0") == 2
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_termination_keeps_what_was_learnt(tmp_path, number):
-    process = subprocess.Popen(
-        [sys.executable, str(ROOT / "train.py"), "learner.n_epochs=100000", "evaluation.pictures=false"],
-        cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+def test_command_line_error(typed):
+    process, cwd = typed["error"]
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == 1
+    assert err.startswith("error: learner.beta=two: Value 'two'")
+    assert err.count("\n") == 1
+    assert out == ""
+    assert list(cwd.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("argument", "code", "start"),
+    [
+        ("learner.beta=-1", 1, "error: learner.beta=-1.0: must be a finite number > 0"),
+        ("+learner.betta=2", 1, "error: learner.betta=2: must be left out: no such key; there are"),
+        ("learner.beta=two", 1, "error: learner.beta=two: Value 'two'"),
+        ("beta", 2, "error: beta: not of the form key=value"),
+        ("hydra.run.dir=/dev/null/here", 1, "error: /dev/null/here: Not a directory"),
+    ],
+)
+def test_errors_are_one_line(typed_here, tmp_path, argument, code, start):
+    found, out, err = typed_here("train.py", argument)
+    assert found == code
+    assert err.startswith(start)
+    assert err.count("\n") == 1
+    assert out == ""
+    assert not list(tmp_path.rglob("runs/*"))
+
+
+def test_help_is_complete_and_needs_no_torch(tmp_path):
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "train.py"), "--help"],
+        cwd=tmp_path, capture_output=True, text=True, timeout=120, env={**os.environ, "PYTHONPROFILEIMPORTTIME": "1"},
     )  # fmt: skip
-    deadline = time.monotonic() + 60
-    while time.monotonic() < deadline and not list(tmp_path.rglob("events.*")):
-        time.sleep(0.1)
-    time.sleep(1.5)
-    process.send_signal(number)
-    out, _ = process.communicate(timeout=60)
-    assert process.returncode == 128 + number
-    assert "stopped by the caller" in out
-    (directory,) = (tmp_path / "runs" / "windy_cliff").iterdir()
-    result = json.loads((directory / "result.json").read_text())
-    assert result["status"] == "stopped"
-    assert result["n_tuples"] > 0
-    logged = events(directory).Scalars("s1/theta")
-    assert logged[-1].step == result["n_tuples"]
-    assert logged[-1].value == pytest.approx(result["theta"], rel=1e-6)
+    assert done.returncode == 0
+    for text in ("python train.py env=windy_cliff", "windy_cliff,windy_frozen_lake", "lr_psi: 0.1", "conf/"):
+        assert text in done.stdout
+    assert " gymnasium\n" in done.stderr
+    for module in (" torch\n", " numba\n", " scipy\n", " matplotlib\n"):
+        assert module not in done.stderr
+    assert not (tmp_path / "runs").exists()
 
 
 @pytest.mark.parametrize(
@@ -321,7 +354,8 @@ def test_termination_keeps_what_was_learnt(tmp_path, number):
 )
 def test_environments_are_learnt(tmp_path, overrides, better):
     """The learnt policy's return in the environment lies clearly above the prior's."""
-    result = train(composed(*overrides, "experience.n_episodes=200", "evaluation.pictures=false"), tmp_path)
+    small = ("experience.n_episodes=200", "evaluation.every=15", "evaluation.pictures=false")
+    result = train(composed(*overrides, *small), tmp_path)
     returns = [event.value for event in events(tmp_path).Scalars("eval/return")]
     assert result["status"] == "completed"
     assert returns[-1] > returns[0] + better
@@ -360,7 +394,8 @@ def test_wind_fields_come_from_a_file(tmp_path):
 
 def test_exact_return_of_an_episode(tmp_path):
     """FrozenLake's return is the probability of reaching the goal in its 100 steps: against env.step."""
-    result = train(composed("env=frozen_lake", "learner=exact", "learner.beta=200"), tmp_path)
+    overrides = ("env=frozen_lake", "learner=exact", "learner.beta=200", "evaluation.pictures=false")
+    result = train(composed(*overrides), tmp_path)
     policy = Solution.load(tmp_path / "solution.npz").policy.numpy()
     played = evaluate(gym.make("FrozenLake-v1"), policy, 200.0, np.random.default_rng(0), 3000, 100).mean_return
     assert abs(result["return"] - played) < 4.5 * 0.5 / np.sqrt(3000)
@@ -386,7 +421,7 @@ def test_environments_by_id(given, expected):
 def test_control_tasks_are_learnt(tmp_path, monkeypatch, stream):
     """Pendulum on few samples: the learnt policy's return in the original lies far above the prior's."""
     monkeypatch.setenv("ERL_TORCH_CACHE", str(tmp_path / "cache"))
-    small = ("env.n_samples=50", "experience.n_episodes=4000", "evaluation.every=15", "evaluation.pictures=false")
+    small = ("env.n_samples=50", "experience.n_episodes=1000", "evaluation.every=15", "evaluation.pictures=false")
     result = train(composed("env=pendulum", f"env.stream={stream}", *small), tmp_path / "run")
     returns = [event.value for event in events(tmp_path / "run").Scalars("eval/return")]
     assert returns[-1] > returns[0] + 1000
@@ -396,8 +431,9 @@ def test_control_tasks_are_learnt(tmp_path, monkeypatch, stream):
 
 
 def test_continuous_observations_are_binned(tmp_path):
-    common = ("env=gym", "env.id=MountainCar-v0", "experience.n_episodes=20", "evaluation.every=15")
-    result = train(composed(*common, "env.bins=6", "learner.beta=1"), tmp_path / "run")
+    small = ("experience.n_episodes=20", "learner.n_bias=2", "evaluation.every=15", "evaluation.pictures=false")
+    overrides = ("env=gym", "env.id=MountainCar-v0", "env.bins=6", "learner.beta=1")
+    result = train(composed(*overrides, *small), tmp_path / "run")
     assert Solution.load(tmp_path / "run" / "solution.npz").policy.shape == (36, 3)
     assert result["status"] == "completed"
     with pytest.raises(InputError, match=r"env\.low\[1\]=-?inf: must be finite: dimension 1"):

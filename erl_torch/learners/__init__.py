@@ -15,7 +15,7 @@ from erl_torch.learners.action_value import (
     ULearning,
 )
 from erl_torch.learners.algorithm_s1 import AlgorithmS1, S1State
-from erl_torch.learners.certainty_equivalence import CertaintyEquivalence
+from erl_torch.learners.certainty_equivalence import CertaintyEquivalence, CertaintyEquivalenceState
 from erl_torch.learners.efficient_s1 import EfficientS1, EfficientState
 from erl_torch.learners.exact import Exact, ExactState
 from erl_torch.learners.fitting import NonFiniteError
@@ -34,6 +34,30 @@ LEARNERS: dict[str, Any] = {
     "certainty_equivalence": CertaintyEquivalence,
     "exact": Exact,
 }
+
+
+def states() -> tuple[type, ...]:
+    """All classes that states of learners are made of: what a checkpoint may hold."""
+    from erl_torch.evaluation import Evaluation
+    from erl_torch.learners.replicas import EachState
+    from erl_torch.learners.s1_lanes import LanesState
+    from erl_torch.learners.z_learning import ZState
+    from erl_torch.solution import Solution, Status
+
+    return (
+        ActionValueState,
+        CertaintyEquivalenceState,
+        EachState,
+        EfficientState,
+        Evaluation,
+        LanesState,
+        NonFiniteError,
+        S1State,
+        Solution,
+        Status,
+        ZState,
+    )
+
 
 __all__ = [
     "LEARNERS",

@@ -135,9 +135,11 @@ class ActionValueLearner:
         """
         return run_to_end(self, transitions, n_states, n_actions)
 
-    def iterate(self, transitions: Transitions, n_states: int, n_actions: int) -> Iterator[ActionValueState]:
+    def iterate(
+        self, transitions: Transitions, n_states: int, n_actions: int, state: ActionValueState | None = None
+    ) -> Iterator[ActionValueState]:
         """Yield the state after each pass, n_epochs times. Raises NonFiniteError."""
-        yield from epochs(self, transitions, n_states, n_actions)
+        yield from epochs(self, transitions, n_states, n_actions, state)
 
     def finished(self, state: ActionValueState) -> bool:
         """After the last pass."""

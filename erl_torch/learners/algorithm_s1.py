@@ -217,13 +217,15 @@ class AlgorithmS1:
         """
         return run_to_end(self, transitions, n_states, n_actions)
 
-    def iterate(self, transitions: Transitions, n_states: int, n_actions: int) -> Iterator[S1State]:
-        """Yield the state after each epoch of the u phase: n_bias * n_epochs times.
+    def iterate(
+        self, transitions: Transitions, n_states: int, n_actions: int, state: S1State | None = None
+    ) -> Iterator[S1State]:
+        """Yield the state after each epoch of the u phase: n_bias * n_epochs times, or what is left after ``state``.
 
         The caller may log it, save it, or stop. Raises NonFiniteError with step and cause; the state
         yielded last is then still good.
         """
-        yield from epochs(self, transitions, n_states, n_actions)
+        yield from epochs(self, transitions, n_states, n_actions, state)
 
     def finished(self, state: S1State) -> bool:
         """After the last epoch of the last biasing iteration."""

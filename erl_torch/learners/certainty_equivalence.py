@@ -96,9 +96,11 @@ class CertaintyEquivalence:
         (state,) = self.iterate(transitions, n_states, n_actions)
         return self.solution(state, [state.metrics()])
 
-    def iterate(self, transitions: Transitions, n_states: int, n_actions: int) -> Iterator[CertaintyEquivalenceState]:
+    def iterate(
+        self, transitions: Transitions, n_states: int, n_actions: int, state: CertaintyEquivalenceState | None = None
+    ) -> Iterator[CertaintyEquivalenceState]:
         """Yield the one state."""
-        yield from epochs(self, transitions, n_states, n_actions)
+        yield from epochs(self, transitions, n_states, n_actions, state)
 
     def finished(self, state: CertaintyEquivalenceState) -> bool:
         """Once solved."""

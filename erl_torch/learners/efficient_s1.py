@@ -259,9 +259,11 @@ class EfficientS1:
         """
         return run_to_end(self, transitions, n_states, n_actions)
 
-    def iterate(self, transitions: Transitions, n_states: int, n_actions: int) -> Iterator[EfficientState]:
+    def iterate(
+        self, transitions: Transitions, n_states: int, n_actions: int, state: EfficientState | None = None
+    ) -> Iterator[EfficientState]:
         """Yield the state after each epoch: n_bias * n_epochs times, or until certified."""
-        yield from epochs(self, transitions, n_states, n_actions)
+        yield from epochs(self, transitions, n_states, n_actions, state)
 
     def finished(self, state: EfficientState) -> bool:
         """Certified, or after the last epoch of the last biasing iteration."""

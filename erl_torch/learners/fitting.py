@@ -20,10 +20,13 @@ class NonFiniteError(ArithmeticError):
         return f"step {self.step}: {self.cause}"
 
 
-def epochs(learner: Any, transitions: Transitions, n_states: int, n_actions: int) -> Iterator[Any]:
-    """The states of ``learner`` after each epoch, until it is finished. Raises what its ``step`` raises."""
+def epochs(learner: Any, transitions: Transitions, n_states: int, n_actions: int, state: Any = None) -> Iterator[Any]:
+    """The states of ``learner`` after each epoch, from ``state`` on, until it is finished.
+
+    Raises what its ``step`` raises.
+    """
     stream = learner.prepare(transitions, n_states, n_actions)
-    state = learner.init(n_states, n_actions)
+    state = learner.init(n_states, n_actions) if state is None else state
     while not learner.finished(state):
         state = learner.step(state, stream)
         yield state

@@ -228,13 +228,15 @@ class Replicas:
         assert state is not None
         return self.solution(state, history)
 
-    def iterate(self, experience: Experience, n_states: int, n_actions: int) -> Iterator[ReplicaState]:
-        """Yield the state of all replicas after each epoch, until the last is done or has failed."""
+    def iterate(
+        self, experience: Experience, n_states: int, n_actions: int, state: Any = None
+    ) -> Iterator[ReplicaState]:
+        """Yield the state of all replicas after each epoch, from ``state`` on, until the last is done or has failed."""
         self._check(experience, n_states, n_actions)
         from erl_torch.learners.s1_lanes import can_interleave, interleave
 
         run = interleave if can_interleave(self, experience) else each
-        return run(self, experience, n_states, n_actions)
+        return run(self, experience, n_states, n_actions, state)
 
     def solution(self, state: ReplicaState, history: Sequence[dict[str, np.ndarray]] = ()) -> ReplicaSolution:
         """The solutions that ``state`` stands for; ``history`` holds one ``metrics()`` an epoch."""
@@ -320,13 +322,15 @@ class EachState:
         return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
 
-def each(replicas: Replicas, experience: Experience, n_states: int, n_actions: int) -> Iterator[EachState]:
+def each(
+    replicas: Replicas, experience: Experience, n_states: int, n_actions: int, state: EachState | None = None
+) -> Iterator[EachState]:
     """``Replicas.iterate`` of any learner that streams. Prepared streams are held where they fit, else made again."""
     learners, prior = replicas.learners, replicas.prior_policy(n_states, n_actions)
     held: list[Any] = [None] * len(replicas)
     hold = fits(experience, len(replicas), PREPARED_BYTES)
-    states = [learner.init(n_states, n_actions) for learner in learners]
-    failures: dict[int, NonFiniteError] = {}
+    states = list(state.states) if state else [learner.init(n_states, n_actions) for learner in learners]
+    failures = dict(state.failures) if state else {}
 
     def go_on(r: int) -> Any:
         try:

@@ -119,12 +119,14 @@ class LanesState:
         return found
 
 
-def interleave(replicas: Replicas, experience: Experience, n_states: int, n_actions: int) -> Iterator[LanesState]:
+def interleave(
+    replicas: Replicas, experience: Experience, n_states: int, n_actions: int, state: LanesState | None = None
+) -> Iterator[LanesState]:
     """``Replicas.iterate`` of published Algorithm S1."""
     engine = Engine(replicas, experience, n_states, n_actions)
     with ThreadPoolExecutor(replicas.workers) as pool:
         lanes = engine.prepare(pool)
-        state = engine.init()
+        state = engine.init() if state is None else state
         while not replicas.learners[0].finished(state) and len(state.ended) < len(replicas):
             state = engine.step(state, lanes, pool)
             yield state

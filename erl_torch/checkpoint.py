@@ -1,0 +1,199 @@
+"""Checkpoints of a run: everything that is needed to go on, bit for bit, in files that no crash can spoil.
+
+A run directory has ``settings.json`` from the start, and ``checkpoints/`` until the run is complete. A checkpoint is a
+line with its SHA-256, then what ``torch.save`` makes of numbers, tensors and containers, read back with
+``weights_only``. It is written under a temporary name and renamed; the last two are kept, and one that is damaged
+is passed over.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import shutil
+import sys
+import time
+import zlib
+from collections.abc import Callable, Mapping
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from erl_torch.checks import InputError
+from erl_torch.files import write_bytes, write_json
+from erl_torch.learners import states
+from erl_torch.transitions import Transitions
+
+FORMAT = 1
+KEPT = 2
+FREE = ("threads", "checkpoint_every")  # settings that no result depends on
+CLASSES: dict[str, Any] = {one.__name__: one for one in states()}
+
+
+class Checkpoints:
+    """The checkpoints of a run directory.
+
+    Args:
+        directory: the run's.
+        settings: what the run computes with; a directory of other settings is refused.
+        every: seconds between checkpoints; 0 is after every epoch, None is none but on a stop.
+        device: where the tables of a checkpoint go.
+
+    Raises:
+        InputError: the directory holds a run of other settings; the first keys that differ are named.
+    """
+
+    def __init__(self, directory: Path, settings: Mapping[str, Any], every: float | None, device: str = "cpu") -> None:
+        self.directory, self.every, self.device = directory, every, device
+        self._folder = directory / "checkpoints"
+        self._settings = {key: value for key, value in _flat(settings).items() if key.split(".")[0] not in FREE}
+        self._last = time.monotonic()
+        self._check(directory / "settings.json")
+
+    def start(self) -> dict[str, Any] | None:
+        """Take possession of the directory (leftovers of a killed run go), and ``read``; None: the run begins."""
+        write_json(self.directory / "settings.json", self._settings)
+        for leftover in (*self.directory.glob(".*.tmp"), *self._folder.glob(".*.tmp")):
+            leftover.unlink(missing_ok=True)
+        return self.read()
+
+    def read(self) -> dict[str, Any] | None:
+        """The newest checkpoint that can be read; those that cannot go, with a warning."""
+        for path in sorted(self._folder.glob("*.ckpt"), reverse=True):
+            try:
+                found = _read(path, self.device)
+            except (OSError, ValueError) as error:
+                print(f"warning: {path} cannot be read ({error}): going on from the one before", file=sys.stderr)
+                path.unlink(missing_ok=True)
+                continue
+            return found
+        return None
+
+    def result(self) -> dict[str, Any] | None:
+        """What the run came to, if it is complete."""
+        try:
+            found: dict[str, Any] = json.loads((self.directory / "result.json").read_text())
+        except (OSError, ValueError):
+            return None
+        return None if found.get("status") == "stopped" else found
+
+    def offer(self, step: int, content: Callable[[], dict[str, Any]], now: bool = False) -> None:
+        """Write ``content()`` as the checkpoint of ``step``, if it is time (or at once, ``now``)."""
+        if not now and (self.every is None or time.monotonic() - self._last < self.every):
+            return
+        _write(self._folder / f"{step:018d}.ckpt", content())
+        for path in sorted(self._folder.glob("*.ckpt"))[:-KEPT]:
+            path.unlink(missing_ok=True)
+        self._last = time.monotonic()
+
+    def clear(self) -> None:
+        """The run is complete: none is needed any more."""
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+    def _check(self, path: Path) -> None:
+        if not path.exists():
+            return
+        try:
+            before = json.loads(path.read_text())
+        except ValueError as error:
+            raise InputError("settings", path, f"readable JSON ({error}); move it away to begin anew") from error
+        differ = sorted(key for key in {**before, **self._settings} if before.get(key) != self._settings.get(key))
+        if differ:
+            shown = ", ".join(f"{key}={self._settings.get(key)} (there: {before.get(key)})" for key in differ[:5])
+            more = f" and {len(differ) - 5} more" if len(differ) > 5 else ""
+            allowed = f"of a run with these settings, or a new one: not {shown}{more}"
+            raise InputError("hydra.run.dir", self.directory, allowed)
+
+
+def digest(data: Transitions) -> int:
+    """A checksum of all columns."""
+    found = 0
+    for field in fields(data):
+        found = zlib.crc32(memoryview(getattr(data, field.name)), found)
+    return found
+
+
+# -- values and their files -----------------------------------------------------------------------------
+
+
+def encode(value: Any) -> Any:
+    """``value`` in containers, numbers, text and tensors; dataclasses and errors by the name of their class."""
+    if isinstance(value, np.ndarray):
+        return {"class": "array", "value": torch.from_numpy(np.ascontiguousarray(value))}
+    if is_dataclass(value) and not isinstance(value, type):
+        return {"class": type(value).__name__, **{f.name: encode(getattr(value, f.name)) for f in fields(value)}}
+    if isinstance(value, ArithmeticError):
+        return {"class": type(value).__name__, "arguments": list(value.args)}
+    if isinstance(value, Mapping):
+        return {"class": "dict", "items": [(encode(k), encode(v)) for k, v in value.items()]}
+    if isinstance(value, tuple) and hasattr(value, "_asdict"):
+        return {"class": type(value).__name__, **{name: encode(item) for name, item in value._asdict().items()}}
+    if isinstance(value, tuple):
+        return {"class": "tuple", "items": [encode(item) for item in value]}
+    if isinstance(value, list):
+        return [encode(item) for item in value]
+    if isinstance(value, np.generic):
+        return value.item()
+    if hasattr(value, "name") and type(value).__name__ in CLASSES:  # an enumeration
+        return {"class": type(value).__name__, "member": value.name}
+    return value.detach().cpu() if isinstance(value, torch.Tensor) else value
+
+
+def decode(value: Any, device: str = "cpu") -> Any:
+    """What ``encode`` was given. Raises ValueError for a class that no state is made of."""
+    if isinstance(value, list):
+        return [decode(item, device) for item in value]
+    if isinstance(value, torch.Tensor):
+        return value.to(device)
+    if not isinstance(value, dict):
+        return value
+    kind = value["class"]
+    if kind == "array":
+        return value["value"].numpy()
+    if kind == "dict":
+        return {decode(k, device): decode(v, device) for k, v in value["items"]}
+    if kind == "tuple":
+        return tuple(decode(item, device) for item in value["items"])
+    if kind not in CLASSES:
+        raise ValueError(f"unknown class {kind}")
+    if "arguments" in value:
+        return CLASSES[kind](*value["arguments"])
+    if "member" in value:
+        return CLASSES[kind][value["member"]]
+    return CLASSES[kind](**{name: decode(item, device) for name, item in value.items() if name != "class"})
+
+
+def _write(path: Path, content: Any) -> None:
+    buffer = io.BytesIO()
+    torch.save({"format": FORMAT, "content": encode(content)}, buffer)
+    body = buffer.getvalue()
+    write_bytes(path, hashlib.sha256(body).hexdigest().encode() + b"\n" + body)
+
+
+def _read(path: Path, device: str) -> dict[str, Any]:
+    """Raises ValueError or OSError where the file is not what was written."""
+    line, _, body = path.read_bytes().partition(b"\n")
+    if hashlib.sha256(body).hexdigest().encode() != line:
+        raise ValueError("its checksum does not match")
+    try:
+        whole = torch.load(io.BytesIO(body), weights_only=True)
+        if whole["format"] != FORMAT:
+            raise ValueError(f"it is of format {whole['format']}, not {FORMAT}")
+        found: dict[str, Any] = decode(whole["content"], device)
+    except (KeyError, TypeError, RuntimeError) as error:
+        raise ValueError(str(error).splitlines()[0]) from error
+    return found
+
+
+def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for key, value in settings.items():
+        if isinstance(value, Mapping) and value:
+            found |= _flat(value, f"{prefix}{key}.")
+        else:
+            found[f"{prefix}{key}"] = value
+    return found
