@@ -161,6 +161,7 @@ def run(main: Callable[[], Any], about: str, conf: Path, config_name: str) -> No
     full = bool(os.environ.get("HYDRA_FULL_ERROR"))
     # Hydra then raises what it would otherwise print over several lines.
     os.environ["HYDRA_FULL_ERROR"] = "1"
+    rows: list[dict[str, Any]] = []
     try:
         sweeps.presets()
         if {"-h", "--help"} & set(arguments):
@@ -174,6 +175,8 @@ def run(main: Callable[[], Any], about: str, conf: Path, config_name: str) -> No
     except KeyboardInterrupt:
         raise SystemExit(130) from None
     except Exception as error:
+        if rows and len(sweeps.failures(rows)) == len(rows):
+            raise SystemExit(1) from None  # a sweeper has nothing to choose from, and says so in its own way
         if full or not isinstance(error, BY_CONFIGURATION + BY_RUN):
             raise
         raise SystemExit(_report(error)) from None

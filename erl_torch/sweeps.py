@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import math
+import re
 import shutil
 import subprocess
 import sys
@@ -30,6 +32,7 @@ from erl_torch.files import write_json
 
 EXTRAS = {"joblib": "joblib", "submitit_slurm": "slurm", "submitit_local": "slurm", "optuna": "optuna"}
 COLUMNS = ("theta", "objective", "gap", "seconds")  # of result.json
+LONG = r"(?<==)-?\d*\.\d{5,}(e-?\d+)?$"
 OVER = ("ended", "failed")  # what a note says of a job that need not be started again
 # What Slurm calls the end of a job, whatever brought it about.
 ENDS = {"BOOT_FAIL", "CANCELLED", "COMPLETED", "DEADLINE", "FAILED", "NODE_FAIL", "OUT_OF_MEMORY", "PREEMPTED"}
@@ -50,6 +53,7 @@ def presets() -> None:
     with contextlib.suppress(ImportError):
         from hydra_plugins.hydra_optuna_sweeper.config import Direction, OptunaSweeperConf
 
+        logging.getLogger("alembic").setLevel(logging.WARNING)  # of Optuna's databases; none is used
         # The objective is a reward, and a trial that fails is no reason to end the study.
         optuna = OptunaSweeperConf(direction=Direction.maximize, max_failure_rate=1.0)
         store.store(group="hydra/sweeper", name="optuna", node=optuna, provider="erl_torch")
@@ -127,7 +131,8 @@ def table(sweep: Path, rows: Sequence[dict[str, Any]]) -> str:
     shared = [o for o in rows[0]["overrides"] if len(rows) > 1 and all(o in row["overrides"] for row in rows)]
 
     def own(row: dict[str, Any]) -> str:
-        return " ".join(o for o in row["overrides"] if o not in shared)
+        # Sweepers draw steps of 17 digits.
+        return " ".join(re.sub(LONG, lambda n: f"{float(n[0]):.4g}", o) for o in row["overrides"] if o not in shared)
 
     def figure(name: str, value: float | None) -> str:
         return "" if value is None else f"{value:.1f}" if name == "seconds" else f"{value:.6g}"
