@@ -1,5 +1,6 @@
 """Sweeps: a job that fails or dies costs no other, and the table says what became of each."""
 
+import contextlib
 import json
 import os
 import signal
@@ -58,14 +59,21 @@ def toy(tmp_path):
     """Starts the program in ``tmp_path``; gives the process."""
     (tmp_path / "toy.py").write_text(TOY)
 
+    started = []
+
     def start(*arguments):
-        return subprocess.Popen(
-            [sys.executable, "toy.py", "hydra/job_logging=none", *arguments],
+        process = subprocess.Popen(
+            [sys.executable, "toy.py", *arguments, "hydra/job_logging=none"],
             cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)},
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
+        started.append(process)
+        return process
 
-    return start
+    yield start
+    for process in started:
+        process.kill()
+        process.communicate()
 
 
 def rows(sweep):
@@ -75,11 +83,10 @@ def rows(sweep):
 def test_every_launcher_runs_all_jobs_and_lists_all_failures(tmp_path, toy):
     """... whatever becomes of a job; a process of its own may die, and the job is started once more."""
     ends = ["well", "bad_input", "bug", "last"]
-    in_processes = [*ends[:3], "dies_once", "dies", "terminates", "last"]
     started = {
         "basic": (ends, ["hydra.sweeper.max_batch_size=1"]),
-        "joblib": (in_processes, ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]),
-        "submitit_local": ([*in_processes[:5], "last"], ["hydra/launcher=submitit_local"]),
+        "joblib": ([*ends[:3], "dies", "terminates", "last"], ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]),
+        "submitit_local": (["bad_input", "bug", "dies_once"], ["hydra/launcher=submitit_local"]),
     }
     processes = {
         name: toy("-m", f"end={','.join(ends)}", "x=2", f"hydra.sweep.dir={name}", *more)
@@ -119,21 +126,33 @@ def test_every_launcher_runs_all_jobs_and_lists_all_failures(tmp_path, toy):
 
 
 def test_optuna_maximises_the_objective_past_failed_trials(tmp_path, toy):
-    search = ["-m", "hydra/sweeper=optuna", "hydra.sweeper.n_trials=6", "hydra.sweeper.sampler.seed=0"]
-    some = toy(*search, "end=unlucky", "x=interval(0,1)", "hydra.sweep.dir=some")
-    none = toy(*search, "end=bug", "x=interval(0,1)", "hydra.sweep.dir=none")
-    out, err = some.communicate(timeout=60)
-    assert some.returncode == 1, err
-    trials = json.loads((tmp_path / "some" / "sweep.json").read_text())["jobs"]
+    search = ["hydra/sweeper=optuna", "hydra.sweeper.n_trials=6", "hydra.sweeper.sampler.seed=0"]
+    process = toy("-m", *search, "end=unlucky", "x=interval(0,1)", "hydra.sweep.dir=here")
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == 1, err
+    trials = json.loads((tmp_path / "here" / "sweep.json").read_text())["jobs"]
     values = [row["objective"] for row in trials if row["status"] == "converged"]
     assert len(trials) == 6
     assert 0 < len(values) < 6
-    assert OmegaConf.load(tmp_path / "some" / "optimization_results.yaml").best_value == max(values)
+    assert OmegaConf.load(tmp_path / "here" / "optimization_results.yaml").best_value == max(values)
     assert out.count("RuntimeError: a bug") == 6 - len(values)
-    out, err = none.communicate(timeout=60)
-    assert none.returncode == 1
-    assert "6 jobs, 6 failed" in out
-    assert "No trials" not in err
+
+
+def test_a_search_without_a_single_result_ends_in_its_failures(tmp_path, monkeypatch, capsys):
+    """Optuna ends it with an exception of its own, which would tell the user less."""
+
+    def main():
+        sweeps.note(tmp_path, 0, "failed", complaint="a bug")
+        raise ValueError("No trials are completed yet.")
+
+    (tmp_path / "sweep.json").write_text('{"jobs": [{"job": 0, "overrides": ["x=1"], "status": "waiting"}]}')
+    monkeypatch.setattr(sweeps, "patient_launchers", lambda: contextlib.nullcontext([tmp_path]))
+    monkeypatch.setattr(sys, "argv", ["train.py", "-m"])
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "")
+    with pytest.raises(SystemExit) as stopped:
+        cli.run(main, "", ROOT / "conf", "train")
+    assert stopped.value.code == 1
+    assert "failed: job 0 (x=1): a bug" in capsys.readouterr().out
 
 
 def test_processes_at_once_never_share_a_directory(tmp_path, toy):
