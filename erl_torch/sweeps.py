@@ -33,6 +33,7 @@ from erl_torch.files import write_json
 EXTRAS = {"joblib": "joblib", "submitit_slurm": "slurm", "submitit_local": "slurm", "optuna": "optuna"}
 COLUMNS = ("theta", "objective", "gap", "seconds")  # of result.json
 LONG = r"(?<==)-?\d*\.\d{5,}(e-?\d+)?$"
+OPEN = ("waiting", "running")
 OVER = ("ended", "failed")  # what a note says of a job that need not be started again
 # What Slurm calls the end of a job, whatever brought it about.
 ENDS = {"BOOT_FAIL", "CANCELLED", "COMPLETED", "DEADLINE", "FAILED", "NODE_FAIL", "OUT_OF_MEMORY", "PREEMPTED"}
@@ -78,20 +79,21 @@ def _note(sweep: Path, number: int) -> Path:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """A JSON file, or nothing where there is none."""
+    """A JSON file, or nothing where there is none that can be read."""
     try:
         found: dict[str, Any] = json.loads(path.read_text())
-    except FileNotFoundError:
+    except (OSError, ValueError):
         return {}
     return found
 
 
-def _plan(sweep: Path, jobs: dict[int, list[str]]) -> None:
-    for number in jobs:
-        _note(sweep, number).unlink(missing_ok=True)  # of an earlier sweep in this directory
-    rows = {row["job"]: row for row in _read(sweep / "sweep.json").get("jobs", ())}
-    rows |= {n: {"job": n, "overrides": overrides, "status": "waiting"} for n, overrides in jobs.items()}
-    write_json(sweep / "sweep.json", {"jobs": [rows[number] for number in sorted(rows)]})
+def _plan(sweep: Path, jobs: dict[int, list[str]], anew: bool) -> None:
+    """Add jobs to the table; ``anew`` forgets those of an earlier sweep in this directory."""
+    if anew:
+        shutil.rmtree(sweep / ".jobs", ignore_errors=True)
+    rows = [] if anew else _read(sweep / "sweep.json")["jobs"]
+    rows += [{"job": n, "overrides": overrides, "status": "waiting"} for n, overrides in jobs.items()]
+    write_json(sweep / "sweep.json", {"jobs": rows})
 
 
 def collect(sweep: Path) -> list[dict[str, Any]]:
@@ -117,7 +119,7 @@ def collect(sweep: Path) -> list[dict[str, Any]]:
         if row["directory"] and not (sweep / row["directory"]).exists():
             row["directory"] = None  # bad input: nothing was written
     write_json(sweep / "sweep.json", {"jobs": rows})
-    if all(row["status"] not in ("waiting", "running") for row in rows):
+    if all(row["status"] not in OPEN for row in rows):
         shutil.rmtree(sweep / ".jobs", ignore_errors=True)
     return rows
 
@@ -150,13 +152,14 @@ def table(sweep: Path, rows: Sequence[dict[str, Any]]) -> str:
     ]
     with contextlib.suppress(ValueError):
         sweep = sweep.resolve().relative_to(Path.cwd())
-    failed = failures(rows)
+    failed, open_ = failures(rows), sum(row["status"] in OPEN for row in rows)
+    unfinished = f", {open_} not finished" if open_ else ""
     return "\n".join(
         [
             "",
             *(line.rstrip() for line in text),
             *([f"all jobs: {' '.join(shared)}"] if shared else []),
-            f"{len(rows)} jobs, {len(failed)} failed; table: {sweep / 'sweep.json'}; tensorboard --logdir {sweep}",
+            f"{len(rows)} jobs, {len(failed)} failed{unfinished}; table: {sweep}/sweep.json; tensorboard --logdir {sweep}",
             *(f"failed: job {row['job']} ({own(row)}): {row['complaint']}" for row in failed),
         ]
     )
@@ -193,9 +196,9 @@ class _Patient(Launcher):
 
     def launch(self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> Sequence[JobReturn]:
         jobs = {n: list(overrides) for n, overrides in enumerate(job_overrides, initial_job_idx)}
+        _plan(self.sweep, jobs, anew=self.sweep not in self.sweeps)
         if self.sweep not in self.sweeps:
             self.sweeps.append(self.sweep)
-        _plan(self.sweep, jobs)
         todo = dict(jobs)
         died: set[int] = set()
         while todo:
