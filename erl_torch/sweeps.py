@@ -152,14 +152,14 @@ def table(sweep: Path, rows: Sequence[dict[str, Any]]) -> str:
     ]
     with contextlib.suppress(ValueError):
         sweep = sweep.resolve().relative_to(Path.cwd())
-    failed, open_ = failures(rows), sum(row["status"] in OPEN for row in rows)
-    unfinished = f", {open_} not finished" if open_ else ""
+    failed, unfinished = failures(rows), sum(row["status"] in OPEN for row in rows)
+    counts = f"{len(rows)} jobs, {len(failed)} failed" + (f", {unfinished} not finished" if unfinished else "")
     return "\n".join(
         [
             "",
             *(line.rstrip() for line in text),
             *([f"all jobs: {' '.join(shared)}"] if shared else []),
-            f"{len(rows)} jobs, {len(failed)} failed{unfinished}; table: {sweep}/sweep.json; tensorboard --logdir {sweep}",
+            f"{counts}; table: {sweep}/sweep.json; tensorboard --logdir {sweep}",
             *(f"failed: job {row['job']} ({own(row)}): {row['complaint']}" for row in failed),
         ]
     )
