@@ -360,6 +360,7 @@ def test_replica_of_a_run_is_the_run_of_its_seed(finished, tmp_path):
         "bands.png",
         "replicas.npz",
         "result.json",
+        "settings.json",
     ]
     assert json.loads((directory / "result.json").read_text()) == result
     replicas = ReplicaSolution.load(directory / "replicas.npz")
