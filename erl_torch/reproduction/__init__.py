@@ -14,8 +14,12 @@ if TYPE_CHECKING:
 
 # name (also of the module): what it shows
 ARTIFACTS = {
+    "figure_1": "windy cliff: optimistic and optimal",
+    "figure_2": "a random windy maze",
     "figure_3": "control tasks: returns in the original environments",
     "figure_4": "dynamics shift",
+    "figure_5": "Algorithm S1 on the windy cliff",
+    "figure_s2": "the control tasks",
     "table_s2": "control tasks: biasing iterations",
 }
 SCALES = ("quick", "full")
