@@ -179,7 +179,8 @@ def _reading(fits: list[tuple[int, str, list[int]]], found: dict[str, Any]) -> l
     if by_accuracy:
         reading.append(
             "What the count depends on most is how far the power iteration goes: Acrobot takes "
-            f"{exact} solves with exact eigenvectors, and with a change of y (maximum 1) below {', '.join(by_accuracy)}."
+            f"{exact} solves with exact eigenvectors; with y (maximum 1) as far as its last change, "
+            f"{', '.join(by_accuracy)}."
         )
     closest = f"Closest of {len(fits)} settings of the scan to 28, 38, 29, 58: {name}, with {counts}"
     reading.append(
