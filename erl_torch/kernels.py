@@ -763,7 +763,7 @@ def newton_perron(
     """M exp(h) = rho exp(h) for M = exp(log_m) on the pattern (ptr, ind); h [n] is the start, and becomes the answer.
 
     Power steps, averaged with standing still, until the gains log(M exp h) - h differ by less than 0.1, then Newton
-    steps with factors that are kept while a step with them leaves less than a quarter; ``ref`` is the state where chains are cut.
+    steps, with factors that are kept while a step with them leaves less than a quarter. ``ref``: where chains are cut.
 
     Returns (converged, min gain, max gain, Newton steps): bounds on log rho, before rounding.
     """
@@ -796,7 +796,7 @@ def newton_perron(
         if not np.isfinite(spread) or step == max_steps:
             break
         before = spread
-        for attempt in range(2):
+        for _ in range(2):
             fresh = not factored
             if fresh:
                 cut[:] = chain

@@ -53,9 +53,9 @@ class NewtonPattern:
     def eigenvector(
         self, log_weight: np.ndarray, ref: int, rtol: float, max_steps: int
     ) -> tuple[np.ndarray, tuple[float, float], int] | None:
-        """(h, bounds on log rho, Newton steps) for M(s, s') = sum_a exp(log_weight(s, a)) p(s'|s, a), log_weight [n, A].
+        """(h, bounds on log rho, Newton steps) for M(s, s') = sum_a exp(log_weight(s, a)) p(s'|s, a).
 
-        ``ref`` is a state to cut chains at. None where the iteration fails.
+        log_weight [n, A]; ``ref`` is a state to cut chains at. None where the iteration fails.
         """
         p = self.transition
         log_m = np.empty(self.ind.size)
