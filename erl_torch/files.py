@@ -46,10 +46,14 @@ def write_npz(path: str | os.PathLike[str], arrays: Mapping[str, Any]) -> Path:
 
 def write_json(path: str | os.PathLike[str], value: Mapping[str, Any]) -> Path:
     """Write JSON (no NaN or infinity)."""
-    text = json.dumps(value, indent=2, allow_nan=False) + "\n"
+    return write_bytes(path, (json.dumps(value, indent=2, allow_nan=False) + "\n").encode())
+
+
+def write_bytes(path: str | os.PathLike[str], data: bytes) -> Path:
+    """Write ``data`` as it is."""
 
     def fill(file: BinaryIO) -> None:
-        file.write(text.encode())
+        file.write(data)
 
     return _write(path, fill)
 
