@@ -842,6 +842,63 @@ def newton_perron(
     return False, a, b, max_steps
 
 
+@numba.njit(cache=True, error_model="numpy")
+def capped_power(indptr, indices, data, log_weight, beta, tolerance, max_steps):
+    """Plain power iteration of the tilted matrix, uniform prior, from ones, as the authors' scripts stop it.
+
+    u(s,a) = exp(log_weight(s,a)) sum_s' p(s'|s,a) chi(s') with chi the mean of u over actions, log_weight [n*A], and
+    the same for the other eigenvector v, both normalised; it ends once no logarithm of a component of either moves by
+    more than ``tolerance`` * beta, or after ``max_steps``. Returns (chi [n], steps, last move / beta).
+    """
+    n_pairs = log_weight.size
+    n = int(np.max(indices)) + 1
+    n_actions = n_pairs // n
+    weight = np.exp(log_weight)
+    chi, u, v = np.ones(n), np.ones(n_pairs), np.ones(n)
+    new_chi, new_u, new_v = np.empty(n), np.empty(n_pairs), np.empty(n)
+    bound = math.expm1(tolerance * beta)
+    worst = 0
+    move = np.inf
+    steps = 0
+    while steps < max_steps:
+        steps += 1
+        new_v[:] = 0.0
+        norm_u = 0.0
+        for k in range(n_pairs):
+            share = weight[k] * v[k // n_actions] / n_actions
+            total = 0.0
+            for m in range(indptr[k], indptr[k + 1]):
+                total += data[m] * chi[indices[m]]
+                new_v[indices[m]] += share * data[m]
+            new_u[k] = weight[k] * total
+            norm_u += new_u[k] * new_u[k]
+        scale = 1.0 / math.sqrt(norm_u)
+        for s in range(n):
+            total = 0.0
+            for k in range(s * n_actions, (s + 1) * n_actions):
+                new_u[k] *= scale
+                total += new_u[k]
+            new_chi[s] = total / n_actions
+        new_v /= math.sqrt(np.sum(new_v * new_v))
+        chi, new_chi = new_chi, chi
+        u, new_u = new_u, u
+        v, new_v = new_v, v
+        # As long as the component that moved most still moves, the others need no look.
+        if steps < max_steps and abs(u[worst] / new_u[worst] - 1.0) > 2.0 * bound:
+            continue
+        move = 0.0
+        for k in range(n_pairs):
+            step = abs(math.log(u[k] / new_u[k]))
+            if step > move:
+                move, worst = step, k
+        for s in range(n):
+            move = max(move, abs(math.log(v[s] / new_v[s])))
+        move /= beta
+        if move <= tolerance:
+            break
+    return chi, steps, move
+
+
 # ---------------------------------------------------------------------------------------------------
 # A model from samples
 # ---------------------------------------------------------------------------------------------------
