@@ -77,8 +77,8 @@ def draw_grid(
     _frame(axes, grid)
     _tiles(axes, grid)
     if distribution is not None:
-        scale = shares(float(distribution.max()) if top is None else top)
-        axes.imshow(distribution.reshape(grid.shape), cmap=scale.get_cmap(), norm=scale.norm, zorder=1.2)
+        top = float(distribution.max()) if top is None else top
+        axes.imshow(distribution.reshape(grid.shape), cmap=shares(top).get_cmap(), vmin=0, vmax=top, zorder=1.2)
     _wind(axes, grid)
     if policy is not None:
         _policy(axes, grid, policy)
