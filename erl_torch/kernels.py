@@ -752,6 +752,8 @@ def _gains(ptr, ind, log_m, h, gain, chain):
         for m in range(ptr[s], ptr[s + 1]):
             chain[m] /= total
         gain[s] = top + math.log(total) - h[s]
+        if not np.isfinite(gain[s]):  # min and max would pass over it
+            return -np.inf, np.inf
         low, high = min(low, gain[s]), max(high, gain[s])
     return low, high
 

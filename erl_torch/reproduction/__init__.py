@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 ARTIFACTS = {
     "figure_3": "control tasks: returns in the original environments",
     "figure_4": "dynamics shift",
+    "figure_s1": "spread of the counts of Table S1",
+    "table_s1": "random windy mazes: biasing iterations",
     "table_s2": "control tasks: biasing iterations",
 }
 SCALES = ("quick", "full")

@@ -46,13 +46,13 @@ def count_by_power_iteration(
             p.indptr, p.indices, biased, beta * biased_reward, beta, tolerance, power_steps
         )
         n_capped += not move <= tolerance
-        with np.errstate(divide="ignore", invalid="ignore"):
-            log_chi = np.log(chi)
-            kl = problem.tilt(log_chi + log_psi)[1].max()
-        if kl < KL_TOLERANCE:
-            break
+        if not (np.isfinite(chi).all() and chi.min() > 0):
+            break  # from here on NaN, which passes no test
+        log_chi = np.log(chi)
+        if problem.tilt(log_chi + log_psi)[1].max() < KL_TOLERANCE:
+            return Count(k, n_capped)
         log_psi = -log_chi
-    return Count(k, n_capped)
+    return Count(MAX_ITERATIONS - 1, n_capped)
 
 
 def count_cell(
