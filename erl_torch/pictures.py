@@ -72,6 +72,7 @@ def draw_grid(
     policy: np.ndarray | None = None,
     distribution: np.ndarray | None = None,
     top: float | None = None,
+    wind: bool = True,
 ) -> None:
     """``grid_picture``'s drawing on ``axes``; ``top`` is the share of time with the full colour, None the largest."""
     _frame(axes, grid)
@@ -79,7 +80,8 @@ def draw_grid(
     if distribution is not None:
         top = float(distribution.max()) if top is None else top
         axes.imshow(distribution.reshape(grid.shape), cmap=shares(top).get_cmap(), vmin=0, vmax=top, zorder=1.2)
-    _wind(axes, grid)
+    if wind:
+        _wind(axes, grid)
     if policy is not None:
         _policy(axes, grid, policy)
 

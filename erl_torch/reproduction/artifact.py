@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy.stats
 from matplotlib.figure import Figure
 
 REPRODUCED = "reproduced"
@@ -91,10 +92,19 @@ def compared(
 
 
 def compared_in_distribution(
-    quantity: str, published: float, ours: np.ndarray, rounding: float = 0.0, source: str = PAPER
+    quantity: str, published: float, ours: np.ndarray, source: str = PAPER, in_logs: bool = False
 ) -> Comparison:
-    """Reproduced in distribution if ``published`` (within ``rounding``) lies in the range of our replicas [n]."""
-    low, high = float(np.min(ours)), float(np.max(ours))
-    verdict = IN_DISTRIBUTION if low - rounding <= published <= high + rounding else NOT_REPRODUCED
-    note = f"mean of {len(ours)}; they lie in [{low:.4f}, {high:.4f}]"
-    return Comparison(quantity, published, float(np.mean(ours)), verdict, source, note)
+    """Reproduced in distribution if ``published`` lies where one more of our replicas [n] would, with 95 %.
+
+    Student's prediction interval, of the logarithms if ``in_logs``.
+    """
+    values = np.log(ours) if in_logs else ours
+    half = scipy.stats.t.ppf(0.975, len(ours) - 1) * values.std(ddof=1) * np.sqrt(1 + 1 / len(ours))
+    low, high = values.mean() - half, values.mean() + half
+    inside = low <= (np.log(published) if in_logs else published) <= high
+    if in_logs:
+        low, high = np.exp(low), np.exp(high)
+    note = f"{len(ours)} replicas in [{ours.min():.4g}, {ours.max():.4g}]; 95 % of more: [{low:.4g}, {high:.4g}]"
+    return Comparison(
+        quantity, published, float(ours.mean()), IN_DISTRIBUTION if inside else NOT_REPRODUCED, source, note
+    )

@@ -11,7 +11,7 @@ from erl_torch.envs.control import control_task
 from erl_torch.pictures import COLOURS
 from erl_torch.reproduction.artifact import IN_DISTRIBUTION, NOT_REPRODUCED, Artifact, Comparison, Output, Results
 from erl_torch.reproduction.control import EPISODE_LENGTH, EPISODES, TASKS, work
-from erl_torch.reproduction.table_s2 import published_units
+from erl_torch.reproduction.table_s2 import published_units, samples
 
 WINDOW = 5  # iterations of the moving average
 RISE = 0.5  # of the normalised curve, end over start: "the policies become better"
@@ -35,11 +35,12 @@ def assemble(results: Results, scale: str) -> Output:
     figure = Figure(figsize=(9.6, 5.6))
     figure.text(0.05, 0.955, "Figure 3: return in the original environments", fontsize=12, weight="bold")
     figure.text(
-        0.05, 0.92, f"policy of every biasing iteration; mean of {EPISODES} episodes of at most {EPISODE_LENGTH} steps "
-        f"(points), moving average over {WINDOW} iterations (line), quartiles of the episodes (band)",
-        fontsize=8, color="#555555",
+        0.05, 0.92, f"policy of every biasing iteration; models of {samples(scale)} samples of each (s,a); mean of "
+        f"{EPISODES} episodes of at most {EPISODE_LENGTH} steps (points), moving average over {WINDOW} (line), "
+        "quartiles of episodes (band)",
+        fontsize=7.5, color="#555555",
     )  # fmt: skip
-    together = figure.add_axes((0.7, 0.12, 0.28, 0.73))
+    together = figure.add_axes((0.7, 0.12, 0.28, 0.7))
     for i, (task, title) in enumerate(TASKS.items()):
         returns = results[f"{task}-as_published"]["returns"]
         mean = returns.mean(1)

@@ -59,11 +59,15 @@ ACROBOT_SCAN = ("damping0.75", "damping0.5", "power10", "samples50")
 ACROBOT_SEEDS = 2
 
 
+def samples(scale: str) -> int:
+    """Samples of each (s,a)."""
+    return SAMPLES if scale == "full" else QUICK_SAMPLES
+
+
 def published_units(scale: str, seed: int) -> Units:
     """The four tasks as the paper has them; their policies are also played."""
-    n = SAMPLES if scale == "full" else QUICK_SAMPLES
     return {
-        f"{task}-as_published": {"task": task, "n_samples": n, "seed": seed, "episodes": EPISODES}
+        f"{task}-as_published": {"task": task, "n_samples": samples(scale), "seed": seed, "episodes": EPISODES}
         for task in reversed(TASKS)
     }
 
@@ -132,15 +136,15 @@ def _comparisons(task: str, variants: dict[str, dict[str, np.ndarray]]) -> Itera
     ]
     note = "this count: " + (", ".join(agreeing) if agreeing else "no setting of the scan")
     yield Comparison(f"{name}, k", k, ours, REPRODUCED if ours == k else NOT_REPRODUCED, note=note)
-    samples = [r for v, r in variants.items() if v == "as_published" or _kind(v) == "sample"]
-    counts = [solves(r, "max KL < 1e-6") for r in samples]
+    alike = [r for v, r in variants.items() if v == "as_published" or _kind(v) == "sample"]
+    counts = [solves(r, "max KL < 1e-6") for r in alike]
     low, high = min(c for c in counts if c), max(c for c in counts if c)
     near = low - VARIES <= BY_SCRIPT[task] <= high + VARIES
     text = f"{low} to {high}" if low < high else low
     verdict = IN_DISTRIBUTION if near else NOT_REPRODUCED
     yield Comparison(f"{name}, solves by the script's rule", BY_SCRIPT[task], text, verdict, ORACLE)
     if task in THETA:
-        thetas = np.array([r["theta"][-1] for r in samples])
+        thetas = np.array([r["theta"][-1] for r in alike])
         near = abs(thetas.mean() - THETA[task]) <= 0.1 * THETA[task]
         note = f"{len(thetas)} samples of the model, in [{thetas.min():.4g}, {thetas.max():.4g}]"
         verdict = IN_DISTRIBUTION if near else NOT_REPRODUCED
@@ -168,11 +172,9 @@ def _reading(fits: list[tuple[int, str, list[int]]], found: dict[str, Any]) -> l
 def _figure(found: dict[str, dict[str, Any]], scale: str) -> Figure:
     figure = Figure(figsize=(9.6, 7.4))
     figure.text(0.06, 0.965, "Table S2: biasing iterations of the control tasks", fontsize=12, weight="bold")
-    n = SAMPLES if scale == "full" else QUICK_SAMPLES
-    figure.text(
-        0.06, 0.938, f"largest KL of the optimal dynamics to the model after each eigen-solve; {n} samples of each "
-        "(s,a). The script stops below the dotted line", fontsize=8, color="#555555",
-    )  # fmt: skip
+    about = f"largest KL of the optimal dynamics to the model after each eigen-solve; {samples(scale)} samples of each"
+    about += " (s,a). The script stops below the dotted line"
+    figure.text(0.06, 0.938, about, fontsize=8, color="#555555")
     for i, (task, variants) in enumerate(found.items()):
         axes = figure.add_axes((0.075 + 0.49 * (i % 2), 0.565 - 0.475 * (i // 2), 0.41, 0.32))
         drawn = set()
