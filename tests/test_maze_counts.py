@@ -106,13 +106,13 @@ def plain_power(p, weight, beta, tolerance, max_steps):
     n_actions = n_pairs // n_states
     tilted = np.kron(p, np.ones((1, n_actions)) / n_actions) * weight[:, None]
     u, v = np.ones(n_pairs), np.ones(n_pairs)
-    for steps in range(1, max_steps + 1):
+    steps, move = 0, np.inf
+    while steps < max_steps and move > tolerance:
+        steps += 1
         new_u, new_v = tilted @ u, v @ tilted
         new_u, new_v = new_u / np.linalg.norm(new_u), new_v / np.linalg.norm(new_v)
         move = max(np.abs(np.log(new / old)).max() for new, old in ((new_u, u), (new_v, v))) / beta
         u, v = new_u, new_v
-        if move <= tolerance:
-            break
     return u.reshape(n_states, n_actions).mean(1), steps, move
 
 

@@ -21,6 +21,7 @@ from erl_torch.reproduction.mazes import count_cell
 from erl_torch.reproduction.table_s1 import BETAS, CELLS, DENSITIES, MAZES, SIZES, WIND_LEVELS, Cell, units
 
 DROPPED_FROM = 50  # counts that the figure leaves out
+SMOOTH = 0.3  # iterations, of the violins
 MOST = (2, 6)  # "most of the mazes required between 2 and 6"
 
 
@@ -76,8 +77,8 @@ def _figure(counts: dict[Cell, np.ndarray], scale: str) -> Figure:
     figure = Figure(figsize=(11.5, 8.4))
     figure.text(0.055, 0.965, "Figure S1: biasing iterations of random windy mazes", fontsize=12, weight="bold")
     figure.text(
-        0.055, 0.942, f"{MAZES[scale]} mazes a violin, every eigenvector converged; bar: mean, thin line: least to "
-        "largest; traps for each row length as coloured", fontsize=8, color="#555555",
+        0.055, 0.942, f"{MAZES[scale]} mazes a violin (smoothed over {SMOOTH} iterations), eigenvectors converged; bar: "
+        "mean, thin line: least to largest", fontsize=8, color="#555555",
     )  # fmt: skip
     shown = {cell: k[k < DROPPED_FROM] for cell, k in counts.items()}
     top = max(int(k.max()) for k in shown.values())
@@ -96,23 +97,24 @@ def _figure(counts: dict[Cell, np.ndarray], scale: str) -> Figure:
             axes.grid(axis="y", color="#e4e4e4", linewidth=0.7)
             axes.set_axisbelow(True)
             if i == 0:
-                axes.set_title(f"wind strength ~ Beta({level:g}, 2)", fontsize=9.5)
+                axes.set_title(f"wind level {level:g}: strength ~ Beta({level:g}, 2)", fontsize=9.5)
             if i == 2:
                 axes.set_xlabel("beta, 1/reward", fontsize=9)
             if j == 0:
                 axes.set_ylabel(f"size {size}\nk, iterations", fontsize=9)
     figure.legend(
-        [Patch(color=colour) for colour in colours], [f"{density:.2f}" for density in DENSITIES], title="trap density",
-        loc="upper right", bbox_to_anchor=(0.985, 0.995), ncols=4, fontsize=8, title_fontsize=8, frameon=False,
+        [Patch(color=colour) for colour in colours], [f"{density:.2f}" for density in DENSITIES],
+        title="trap density (traps for each row length)", loc="upper right", bbox_to_anchor=(0.985, 0.995), ncols=4,
+        fontsize=8, title_fontsize=8, frameon=False,
     )  # fmt: skip
     return figure
 
 
 def _violins(axes: Any, samples: list[np.ndarray], at: np.ndarray, colour: str) -> None:
-    """Violins of whole numbers: half-widths are shares of the mazes, smoothed over half an iteration."""
+    """Violins of whole numbers: half-widths are shares of the mazes, smoothed over SMOOTH."""
     for k, x in zip(samples, at, strict=True):
         y = np.linspace(k.min() - 0.9, k.max() + 0.9, 30 * int(np.ptp(k) + 2))
-        density = np.exp(-0.5 * ((y[:, None] - k) / 0.3) ** 2).sum(1)
+        density = np.exp(-0.5 * ((y[:, None] - k) / SMOOTH) ** 2).sum(1)
         axes.fill_betweenx(
             y, x - 0.09 * density / density.max(), x + 0.09 * density / density.max(), color=colour, linewidth=0
         )
