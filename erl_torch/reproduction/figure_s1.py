@@ -77,8 +77,8 @@ def _figure(counts: dict[Cell, np.ndarray], scale: str) -> Figure:
     figure = Figure(figsize=(11.5, 8.4))
     figure.text(0.055, 0.965, "Figure S1: biasing iterations of random windy mazes", fontsize=12, weight="bold")
     figure.text(
-        0.055, 0.942, f"{MAZES[scale]} mazes a violin (smoothed over {SMOOTH} iterations), eigenvectors converged; bar: "
-        "mean, thin line: least to largest", fontsize=8, color="#555555",
+        0.055, 0.942, f"{MAZES[scale]} mazes a violin (smoothed over {SMOOTH} iterations), eigenvectors converged; "
+        "bar: mean, thin line: least to largest", fontsize=8, color="#555555",
     )  # fmt: skip
     shown = {cell: k[k < DROPPED_FROM] for cell, k in counts.items()}
     top = max(int(k.max()) for k in shown.values())
