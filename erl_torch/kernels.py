@@ -845,60 +845,66 @@ def newton_perron(
 
 
 @numba.njit(cache=True, error_model="numpy")
+def _moving(new, old, first, bound):
+    """A component whose ratio new/old is not within 1/bound..bound, looked for from ``first`` on; -1 if all are."""
+    for i in range(new.size):
+        k = (first + i) % new.size
+        ratio = new[k] / old[k]
+        if not (ratio <= bound and ratio * bound >= 1.0):
+            return k
+    return -1
+
+
+@numba.njit(cache=True, error_model="numpy")
 def capped_power(indptr, indices, data, log_weight, beta, tolerance, max_steps):
     """Plain power iteration of the tilted matrix, uniform prior, from ones, as the authors' scripts stop it.
 
     u(s,a) = exp(log_weight(s,a)) sum_s' p(s'|s,a) chi(s') with chi the mean of u over actions, log_weight [n*A], and
     the same for the other eigenvector v, both normalised; it ends once no logarithm of a component of either moves by
-    more than ``tolerance`` * beta, or after ``max_steps``. Returns (chi [n], steps, last move / beta).
+    more than ``tolerance`` * beta, or after ``max_steps``. Returns (chi [n], steps, whether both had converged).
     """
     n_pairs = log_weight.size
     n = int(np.max(indices)) + 1
     n_actions = n_pairs // n
     weight = np.exp(log_weight)
     chi, u, v = np.ones(n), np.ones(n_pairs), np.ones(n)
-    new_chi, new_u, new_v = np.empty(n), np.empty(n_pairs), np.empty(n)
-    bound = math.expm1(tolerance * beta)
-    worst = 0
-    move = np.inf
-    steps = 0
-    while steps < max_steps:
-        steps += 1
-        new_v[:] = 0.0
-        norm_u = 0.0
+    new_u, new_v = np.empty(n_pairs), np.empty(n)
+    bound = math.exp(tolerance * beta)
+    moving_u = moving_v = v_steps = 0
+    for steps in range(1, max_steps + 1):
+        norm = 0.0
         for k in range(n_pairs):
-            share = weight[k] * v[k // n_actions] / n_actions
             total = 0.0
             for m in range(indptr[k], indptr[k + 1]):
                 total += data[m] * chi[indices[m]]
-                new_v[indices[m]] += share * data[m]
             new_u[k] = weight[k] * total
-            norm_u += new_u[k] * new_u[k]
-        scale = 1.0 / math.sqrt(norm_u)
+            norm += new_u[k] * new_u[k]
+        scale = 1.0 / math.sqrt(norm)
         for s in range(n):
             total = 0.0
             for k in range(s * n_actions, (s + 1) * n_actions):
                 new_u[k] *= scale
                 total += new_u[k]
-            new_chi[s] = total / n_actions
-        new_v /= math.sqrt(np.sum(new_v * new_v))
-        chi, new_chi = new_chi, chi
+            chi[s] = total / n_actions
         u, new_u = new_u, u
-        v, new_v = new_v, v
-        # As long as the component that moved most still moves, the others need no look.
-        if steps < max_steps and abs(u[worst] / new_u[worst] - 1.0) > 2.0 * bound:
-            continue
-        move = 0.0
-        for k in range(n_pairs):
-            step = abs(math.log(u[k] / new_u[k]))
-            if step > move:
-                move, worst = step, k
-        for s in range(n):
-            move = max(move, abs(math.log(v[s] / new_v[s])))
-        move /= beta
-        if move <= tolerance:
-            break
-    return chi, steps, move
+        if moving_u >= 0:
+            moving_u = _moving(u, new_u, moving_u, bound)
+            if moving_u >= 0:
+                continue
+        # v is needed only once u has come to rest.
+        while v_steps < steps:
+            v_steps += 1
+            new_v[:] = 0.0
+            for k in range(n_pairs):
+                share = weight[k] * v[k // n_actions] / n_actions
+                for m in range(indptr[k], indptr[k + 1]):
+                    new_v[indices[m]] += share * data[m]
+            new_v /= math.sqrt(np.sum(new_v * new_v))
+            v, new_v = new_v, v
+        moving_v = _moving(v, new_v, max(moving_v, 0), bound)
+        if moving_v < 0 and _moving(u, new_u, 0, bound) < 0:
+            return chi, steps, True
+    return chi, max_steps, False
 
 
 # ---------------------------------------------------------------------------------------------------

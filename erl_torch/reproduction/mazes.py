@@ -42,10 +42,10 @@ def count_by_power_iteration(
         log_mean, _, biased = problem.tilt(log_psi)  # the biased dynamics
         biased_reward = reward + (log_mean - p @ log_psi) / beta
         biased_reward -= biased_reward.max()
-        chi, _, move = kernels.capped_power(
+        chi, _, converged = kernels.capped_power(
             p.indptr, p.indices, biased, beta * biased_reward, beta, tolerance, power_steps
         )
-        n_capped += not move <= tolerance
+        n_capped += not converged
         if not (np.isfinite(chi).all() and chi.min() > 0):
             break  # from here on NaN, which passes no test
         log_chi = np.log(chi)
