@@ -14,6 +14,7 @@ import hydra
 from omegaconf import DictConfig
 
 from erl_torch import cli, config
+from erl_torch.reproduction import ARTIFACTS
 
 config.register()
 
@@ -28,4 +29,5 @@ def main(cfg: DictConfig, directory: Path, safe_point: Callable[[], None]) -> An
 
 
 if __name__ == "__main__":
-    cli.run(main, __doc__, Path(__file__).parent / "conf", "reproduce")
+    names = [f"  {name:10} {about}" for name, about in {**ARTIFACTS, "all": "every one of these"}.items()]
+    cli.run(main, "\n".join([__doc__, "Artifacts:", *names]), Path(__file__).parent / "conf", "reproduce")

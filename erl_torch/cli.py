@@ -147,7 +147,13 @@ def _help(about: str, conf: Path, config_name: str, overrides: list[str]) -> str
         for group in sorted(conf.iterdir())
         if group.is_dir() and "name" in (cfg.get(group.name) or {})
     ]
-    head = [about.rstrip(), "", "Choices:", *choices, "", "Keys and values (each is explained in conf/):", ""]
+    head = [
+        about.rstrip(),
+        "",
+        *(["Choices:", *choices, ""] if choices else []),
+        "Keys and values (each is explained in conf/):",
+        "",
+    ]
     return "\n".join(head) + "\n" + OmegaConf.to_yaml(cfg).rstrip()
 
 

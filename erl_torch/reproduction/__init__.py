@@ -27,7 +27,7 @@ ARTIFACTS = {
 SCALES = ("quick", "full")
 
 
-def artifact(name: str) -> Artifact:
+def load(name: str) -> Artifact:
     """The artifact of that name, which is one of ``ARTIFACTS``."""
     found: Artifact = importlib.import_module(f"erl_torch.reproduction.{name}").ARTIFACT
     return found

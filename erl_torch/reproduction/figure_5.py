@@ -209,7 +209,7 @@ def _figure(results: Results, reward: np.ndarray, j: np.ndarray, exact: dict[str
         axes.set_ylabel("mean reward a step (1000 steps)", fontsize=9)
     whole.set_title("reward; triangles at the right: published ends", fontsize=10)
     whole.set_ylim(-1.67, -0.9)
-    whole.legend(fontsize=7.5, ncols=2, loc=(0.4, 0.15))
+    whole.legend(fontsize=7.5, ncols=2, loc=(0.33, 0.15))
     near.set_title("the same, near the optimum", fontsize=10)
     near.set_ylim(-1.03, -0.93)
     _curves(value, j, range(1, N_BIAS))

@@ -42,7 +42,7 @@ from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.config import check_reproduction_keys
 from erl_torch.files import read_npz, write_bytes, write_json, write_npz
-from erl_torch.reproduction import ARTIFACTS, SCALES, artifact
+from erl_torch.reproduction import ARTIFACTS, SCALES, load
 from erl_torch.reproduction.artifact import PAPER, Artifact, Output
 
 DPI = 130
@@ -65,12 +65,12 @@ def reproduce(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] =
     checks.at_least("processes", cfg.processes, 1)
     torch.set_num_threads(1)
     names = list(ARTIFACTS) if cfg.artifact == "all" else [cfg.artifact]
-    outputs = run([artifact(name) for name in names], directory, cfg.scale, cfg.seed, cfg.processes, safe_point)
+    outputs = run([load(name) for name in names], directory, cfg.scale, cfg.seed, cfg.processes, safe_point)
     for name, output in outputs.items():
         folder = _folder(directory, name, cfg.scale, cfg.seed).resolve()
         with contextlib.suppress(ValueError):
             folder = folder.relative_to(Path.cwd())
-        print(f"\n{summary(artifact(name), output)}\n  files: {folder}")
+        print(f"\n{summary(load(name), output)}\n  files: {folder}")
     return outputs
 
 
