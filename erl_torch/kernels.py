@@ -759,13 +759,44 @@ def _gains(ptr, ind, log_m, h, gain, chain):
 
 
 @numba.njit(cache=True, error_model="numpy")
+def _lazy_steps(ptr, ind, log_m, h, power_steps):
+    """Power steps on exp(h), averaged with standing still, without logarithms; false, and h as it was, if that leaves
+    the range of doubles. They end where the gains log(M exp h) - h differ by less than 0.1."""
+    m_data = np.exp(log_m)
+    y = np.exp(h - np.max(h))
+    after = np.empty_like(y)
+    for _ in range(power_steps):
+        least, most = np.inf, 0.0
+        top = 0.0
+        for s in range(y.size):
+            total = 0.0
+            for m in range(ptr[s], ptr[s + 1]):
+                total += m_data[m] * y[ind[m]]
+            after[s] = total
+            top = max(top, total)
+            least, most = min(least, total / y[s]), max(most, total / y[s])
+        if not (least > 1e-250 and most < 1e250):
+            return False
+        if most < 1.1 * least:
+            break
+        scale = 1.0 / np.max(y)
+        for s in range(y.size):
+            y[s] = y[s] * scale + after[s] / top
+        if not np.min(y) > 1e-250:
+            return False
+    h[:] = np.log(y)
+    return True
+
+
+@numba.njit(cache=True, error_model="numpy")
 def newton_perron(
-    ptr, ind, rank, lptr, lind, uptr, uind, log_m, h, ref, rtol, max_steps, power_steps
+    ptr, ind, rank, lptr, lind, uptr, uind, log_m, h, ref, rtol, max_steps, power_steps, log_power_steps
 ):  # fmt: skip
     """M exp(h) = rho exp(h) for M = exp(log_m) on the pattern (ptr, ind); h [n] is the start, and becomes the answer.
 
-    Power steps, averaged with standing still, until the gains log(M exp h) - h differ by less than 0.1, then Newton
-    steps, with factors that are kept while a step with them leaves less than a quarter. ``ref``: where chains are cut.
+    Power steps (in logarithms where doubles do not reach) until the gains log(M exp h) - h differ by less than 0.1, or
+    there were that many; then Newton steps, with factors that are kept while a step with them leaves less than a
+    quarter. ``ref``: where chains are cut.
 
     Returns (converged, min gain, max gain, Newton steps): bounds on log rho, before rounding.
     """
@@ -779,8 +810,10 @@ def newton_perron(
     low, up, diagonal, to_ref, row = np.empty(lind.size), np.empty(uind.size), np.empty(n), np.empty(n), np.zeros(n)
     hitting = np.empty(n)
     epsilon = 2.0**-52
+    if _lazy_steps(ptr, ind, log_m, h, power_steps):
+        log_power_steps = 0
     a, b = _gains(ptr, ind, log_m, h, gain, chain)
-    for _ in range(power_steps):
+    for _ in range(log_power_steps):
         if b - a < 0.1:  # Newton is quadratic from here
             break
         mean = np.mean(gain)

@@ -14,10 +14,10 @@ import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 
 from erl_torch import kernels
-from erl_torch.solvers.eigenpair import LOG_POWER_STEPS
+from erl_torch.solvers.eigenpair import LOG_POWER_STEPS, POWER_STEPS
 
-MAX_STATES = 2500
-MAX_OPERATIONS = 5_000_000  # multiplications of one LU: some milliseconds
+MAX_STATES = 4000
+MAX_OPERATIONS = 15_000_000  # multiplications of one LU: some ten milliseconds
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +62,7 @@ class NewtonPattern:
         kernels.merge_log_weights(p.indptr, self.log_p, log_weight, self.slot, self.ptr, log_m)
         h = np.zeros(p.shape[1])
         converged, low, high, steps = kernels.newton_perron(
-            self.ptr, self.ind, self.rank, *self.lu, log_m, h, ref, rtol, max_steps, LOG_POWER_STEPS
+            self.ptr, self.ind, self.rank, *self.lu, log_m, h, ref, rtol, max_steps, POWER_STEPS, LOG_POWER_STEPS
         )
         if not converged:
             return None
