@@ -61,7 +61,7 @@ class Signals:
     def _note(self, number: int, frame: Any) -> None:
         self.received = number
         signal.signal(number, signal.SIG_DFL)
-        print("\nstopping after this epoch; what is learnt will be saved", file=sys.stderr)
+        print("\nstopping at the next safe point; what is done will be saved", file=sys.stderr)
 
 
 def job(work: Callable[[DictConfig, Path, Callable[[], None]], Any]) -> Callable[[DictConfig], Any]:

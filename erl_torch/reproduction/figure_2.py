@@ -103,7 +103,7 @@ def _figure(found: dict[str, np.ndarray], maze_seed: int, worst: np.ndarray, mea
     axes.set_yscale("log")
     axes.set_xlabel("biasing iteration", fontsize=9)
     axes.set_ylabel("KL(policy || ground truth), nats", fontsize=9)
-    axes.set_title(f"KL of the policy to ground truth\n(band: {len(worst)} mazes)", fontsize=10)
+    axes.set_title(f"KL of the policy to ground truth\n(lines: this maze, bands: {len(worst)} mazes)", fontsize=10)
     axes.tick_params(labelsize=8)
     axes.legend(fontsize=8)
     return figure

@@ -34,13 +34,19 @@ def assemble(results: Results, scale: str) -> Output:
     comparisons: list[Comparison] = []
     figure = Figure(figsize=(9.6, 5.6))
     figure.text(0.05, 0.955, "Figure 3: return in the original environments", fontsize=12, weight="bold")
-    figure.text(
-        0.05, 0.92, f"policy of every biasing iteration; models of {samples(scale)} samples of each (s,a); mean of "
-        f"{EPISODES} episodes of at most {EPISODE_LENGTH} steps (points), moving average over {WINDOW} (line), "
-        "quartiles of episodes (band)",
-        fontsize=7.5, color="#555555",
-    )  # fmt: skip
-    together = figure.add_axes((0.7, 0.12, 0.28, 0.7))
+    about = (
+        f"policy of every biasing iteration of models of {samples(scale)} samples of each (s,a); {EPISODES} episodes of"
+        f" at most {EPISODE_LENGTH} steps: mean (points),\nits moving average over {WINDOW} iterations (line), "
+        "quartiles (band)"
+    )
+    figure.text(0.05, 0.955, "Figure 3: return in the original environments", fontsize=12, weight="bold")
+    about = (
+        f"policy of every biasing iteration of models of {samples(scale)} samples of each (s,a); {EPISODES} episodes of "
+        f"at most {EPISODE_LENGTH} steps: mean (points),\nits moving average over {WINDOW} iterations (line), quartiles "
+        "(band)"
+    )
+    figure.text(0.05, 0.9, about, fontsize=8, color="#555555")
+    together = figure.add_axes((0.7, 0.11, 0.28, 0.68))
     for i, (task, title) in enumerate(TASKS.items()):
         returns = results[f"{task}-as_published"]["returns"]
         mean = returns.mean(1)
@@ -62,7 +68,7 @@ def assemble(results: Results, scale: str) -> Output:
             Comparison(f"{title}: normalised return rises", "from 0 to 1", f"from {scaled[0]:.2f} to {scaled[-1]:.2f}",
                        verdict, note=note)
         )  # fmt: skip
-        axes = figure.add_axes((0.065 + 0.315 * (i % 2), 0.55 - 0.43 * (i // 2), 0.245, 0.3))
+        axes = figure.add_axes((0.065 + 0.315 * (i % 2), 0.54 - 0.43 * (i // 2), 0.245, 0.29))
         low, high = np.quantile(returns, [0.25, 0.75], axis=1)
         axes.fill_between(k, low, high, color=COLOURS[i], alpha=0.2, linewidth=0)
         axes.plot(k, mean, ".", color=COLOURS[i], markersize=4)

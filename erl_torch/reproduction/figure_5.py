@@ -122,23 +122,18 @@ def assemble(results: Results, scale: str) -> Output:
     exact = references()
     reward, j = (np.array([r[name] for r in results.values()]) for name in ("reward", "objective"))  # [R, bias, epochs]
     ends = reward[:, :, -1]
-    rows: list[dict[str, Any]] = [
-        {
-            "replica": name, "learner": "s1", "bias_iteration": k, "epoch": epoch + 1,
-            "reward_per_step": reward[i, k, epoch], "objective": j[i, k, epoch],
-        }
-        for i, name in enumerate(results) for k in range(reward.shape[1]) for epoch in range(reward.shape[2])
+    rows = [
+        {"learner": "s1", "bias_iteration": k, "epoch": epoch + 1, **_statistics(reward[:, k, epoch], j[:, k, epoch])}
+        for k in range(reward.shape[1]) for epoch in range(reward.shape[2])
     ]  # fmt: skip
-    for name, r in results.items():
-        rows.extend(
-            {"replica": name, "learner": "s1_efficient", "bias_iteration": "", "epoch": epoch + 1,
-             "reward_per_step": values[0], "objective": values[1]}
-            for epoch, values in enumerate(zip(r["efficient_reward"], r["efficient_objective"], strict=True))
-        )  # fmt: skip
-        rows.append(
-            {"replica": name, "learner": "certainty_equivalence", "bias_iteration": "", "epoch": "",
-             "reward_per_step": r["ce_reward"], "objective": r["ce_objective"]}
-        )  # fmt: skip
+    improved_reward, improved_j = (_improved(results, name) for name in ("reward", "objective"))
+    rows += [
+        {"learner": "s1_efficient", "bias_iteration": "", "epoch": epoch + 1,
+         **_statistics(improved_reward[:, epoch], improved_j[:, epoch])}
+        for epoch in range(improved_j.shape[1])
+    ]  # fmt: skip
+    by_counting = (np.array([r[name] for r in results.values()]) for name in ("ce_reward", "ce_objective"))
+    rows.append({"learner": "certainty_equivalence", "bias_iteration": "", "epoch": "", **_statistics(*by_counting)})
     comparisons = _comparisons(results, ends, exact)
     reading = [
         "rho is carried from one biasing iteration to the next and a self-loop reads the old u, as the authors' script "
@@ -157,6 +152,25 @@ def assemble(results: Results, scale: str) -> Output:
         "gaps": {name: [float(r[f"{name}_gap"]) for r in results.values()] for name in GAPS},
     }
     return Output(rows, comparisons, _figure(results, reward, j, exact), reading, data)
+
+
+def _statistics(reward: np.ndarray, j: np.ndarray) -> dict[str, float]:
+    """Over replicas [R]."""
+    return {
+        f"{name}_{what}": float(find(values))
+        for name, values in (("reward_per_step", reward), ("objective", j))
+        for what, find in (
+            ("mean", np.mean), ("min", np.min), ("max", np.max),
+            ("q10", lambda x: np.quantile(x, QUANTILES[0])), ("q90", lambda x: np.quantile(x, QUANTILES[1])),
+        )
+    }  # fmt: skip
+
+
+def _improved(results: Results, name: str) -> np.ndarray:
+    """[R, passes] of the improved learner; where a run was certified and ended, its policy stands."""
+    curves = [r[f"efficient_{name}"] for r in results.values()]
+    longest = max(map(len, curves))
+    return np.array([np.pad(curve, (0, longest - len(curve)), "edge") for curve in curves])
 
 
 def _comparisons(results: Results, ends: np.ndarray, exact: dict[str, Any]) -> list[Comparison]:
@@ -241,17 +255,9 @@ def _curves(axes: Axes, values: np.ndarray, iterations: range) -> None:
 
 def _gaps(axes: Axes, results: Results, j: np.ndarray, best: float) -> None:
     """Loss against passes over the data, of S1 and of the improved learner."""
-    longest = max(len(r["efficient_objective"]) for r in results.values())
-    # A certified run has ended: its policy stands.
-    improved = np.array(
-        [
-            np.pad(r["efficient_objective"], (0, longest - len(r["efficient_objective"])), "edge")
-            for r in results.values()
-        ]
-    )
     for values, colour, name in (
         (j.reshape(len(j), -1), COLOURS[0], "Algorithm S1, as published"),
-        (improved, COLOURS[2], f"{EFFICIENT} (s1_efficient)"),
+        (_improved(results, "objective"), COLOURS[2], f"{EFFICIENT} (s1_efficient)"),
     ):
         loss = np.maximum(best - values, 1e-12)
         passes = np.arange(1, loss.shape[1] + 1)
