@@ -171,7 +171,7 @@ def test_table_of_known_counts():
         for cell in table_s1.CELLS
     }
     results["size30-density0.25-wind4-beta50"]["k"] = np.array([3, 30, 100])
-    output = table_s1.assemble(results, "quick")
+    output = table_s1.assemble(results, "full")
     found = {c.quantity: c for c in output.comparisons}
     assert found["mean k, size 10, density 0.10"].ours == pytest.approx(11 / 3)
     assert found["mean k, size 10, density 0.10"].verdict == REPRODUCED
