@@ -2,8 +2,8 @@
 
     python reproduce.py artifact=all scale=full && python benchmarks/reproduction_page.py
 
-Copies the final files from runs/reproduce to docs/results/reproduction (SVG files where they are small) and writes
-docs/reproduction.md.
+Copies the final files from runs/reproduce to docs/results/reproduction (SVG files where they are small), where those of
+artifacts that were not run stay as they are, and writes docs/reproduction.md.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ FROM, TO, PAGE = (
     ROOT / "docs" / "reproduction.md",
 )
 MOST_SVG = 300_000  # bytes
-SOURCES = {"paper": "", "oracle": " *"}
+SOURCES = {"paper": "", "oracle": " \u2020"}
 HEAD = """# The whole paper, one command each
 
     python reproduce.py artifact=NAME                 a small version
@@ -34,7 +34,7 @@ HEAD = """# The whole paper, one command each
 and also if the run was stopped or killed and started again: it goes on with the units of work that are missing.
 
 Verdicts: *reproduced* (equal to the digits given), *reproduced in distribution* (a random quantity: the published value
-lies where one more of our replicas would), *not reproduced*. Values marked with * are not in the paper: they were
+lies where one more of our replicas would), *not reproduced*. Values marked \u2020 are not in the paper: they were
 computed independently of this package, to high precision or on other samples.
 
 """
@@ -44,13 +44,11 @@ def main() -> None:
     TO.mkdir(parents=True, exist_ok=True)
     abouts = {}
     for name in ARTIFACTS:
-        folder = FROM / f"{name}-full-seed0"
-        for kind in ("csv", "json", "png", "svg"):
-            file = folder / f"{name}.{kind}"
+        for file in sorted((FROM / f"{name}-full-seed0").glob(f"{name}.*")):
             (TO / file.name).unlink(missing_ok=True)
-            if kind != "svg" or file.stat().st_size < MOST_SVG:
+            if file.suffix != ".svg" or file.stat().st_size < MOST_SVG:
                 shutil.copyfile(file, TO / file.name)
-        abouts[name] = json.loads((folder / f"{name}.json").read_text())
+        abouts[name] = json.loads((TO / f"{name}.json").read_text())
     lines = ["| artifact | what | verdict | numbers met |", "|---|---|---|---|"]
     for name, about in abouts.items():
         numbers = about["published_against_ours"]

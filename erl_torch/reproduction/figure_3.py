@@ -39,12 +39,6 @@ def assemble(results: Results, scale: str) -> Output:
         f" at most {EPISODE_LENGTH} steps: mean (points),\nits moving average over {WINDOW} iterations (line), "
         "quartiles (band)"
     )
-    figure.text(0.05, 0.955, "Figure 3: return in the original environments", fontsize=12, weight="bold")
-    about = (
-        f"policy of every biasing iteration of models of {samples(scale)} samples of each (s,a); {EPISODES} episodes of "
-        f"at most {EPISODE_LENGTH} steps: mean (points),\nits moving average over {WINDOW} iterations (line), quartiles "
-        "(band)"
-    )
     figure.text(0.05, 0.9, about, fontsize=8, color="#555555")
     together = figure.add_axes((0.7, 0.11, 0.28, 0.68))
     for i, (task, title) in enumerate(TASKS.items()):

@@ -39,7 +39,10 @@ RULES = {
     "max KL < 1e-6": ("kl", 1e-6),
     "change of chi < 1e-4": ("chi_change", 1e-4),
     "max KL < 1e-2": ("kl", 1e-2),
+    "max KL < 1e-3": ("kl", 1e-3),
     "max KL < 1e-4": ("kl", 1e-4),
+    "max KL < 1e-5": ("kl", 1e-5),
+    "max KL < 1e-7": ("kl", 1e-7),
     "max KL < 1e-8": ("kl", 1e-8),
     "change of chi < 1e-2": ("chi_change", 1e-2),
     "change of chi < 1e-3": ("chi_change", 1e-3),
@@ -85,9 +88,9 @@ def units(scale: str, seed: int) -> Units:
         for task in reversed(TASKS):
             small = task != "acrobot"
             base = {"task": task, "n_samples": SAMPLES, "seed": seed}
-            its |= {f"{task}-{name}": base | change for name, change in SCAN.items() if small or name in ACROBOT_SCAN}
             more = SEEDS if small else ACROBOT_SEEDS
             its |= {f"{task}-sample{i}": base | {"seed": seed + i} for i in range(1, more)}
+            its |= {f"{task}-{name}": base | change for name, change in SCAN.items() if small or name in ACROBOT_SCAN}
     return its
 
 
@@ -225,7 +228,7 @@ def _figure(found: dict[str, dict[str, Any]], scale: str) -> Figure:
         )
         axes.set_title(title, fontsize=9.5)
         if i == 0:
-            axes.legend(fontsize=7, loc="lower right")
+            axes.legend(fontsize=7, loc="upper right")
     return figure
 
 
