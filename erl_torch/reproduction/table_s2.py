@@ -49,7 +49,7 @@ RULES = {
 }
 SCAN: dict[str, dict[str, Any]] = {
     **{f"damping{d}": {"damping": d} for d in (0.9, 0.75, 0.6, 0.5)},
-    **{f"tolerance{t}": {"tolerance": float(t)} for t in ("1e-10", "1e-6", "1e-4", "1e-3", "1e-2", "3e-2")},
+    **{f"tolerance{t}": {"tolerance": float(t)} for t in ("1e-10", "1e-6", "1e-4", "1e-3", "1e-2", "3e-2", "4e-2")},
     **{f"power{n}": {"most_power_steps": n} for n in (5, 10, 20, 50)},
     **{f"samples{n}": {"n_samples": n} for n in (50, 1000)},
 }
@@ -57,14 +57,14 @@ LABELS = {
     "sample": "other seeds of the samples",
     "samples": "50 or 1000 samples",
     "damping": "damped update, .9 to .5",
-    "tolerance": "power iteration to 1e-10 ... 3e-2",
+    "tolerance": "power iteration to 1e-10 ... 4e-2",
     "power": "5 to 50 power steps a solve",
 }
 SEEDS = 5  # samples of the settings as published
 # Acrobot's runs take half a minute each.
 ACROBOT_SCAN = (
     "damping0.75", "damping0.5", "tolerance1e-10", "tolerance1e-4", "tolerance1e-3", "tolerance1e-2", "tolerance3e-2",
-    "power5", "power10", "power20", "samples50",
+    "tolerance4e-2", "power5", "power10", "power20", "samples50",
 )  # fmt: skip
 ACROBOT_SEEDS = 2
 
@@ -180,11 +180,17 @@ def _reading(fits: list[tuple[int, str, list[int]]], found: dict[str, Any]) -> l
         "Eigenvectors are exact in every component, unless a tolerance or a number of power steps is named.",
     ]
     if by_accuracy:
-        reading.append(
+        loose = [
+            f"{variant.removeprefix('tolerance')}: {[solves(found[task][variant], 'max KL < 1e-5') for task in TASKS]}"
+            for variant in ("tolerance3e-2", "tolerance4e-2")
+        ]
+        reading += [
             "What the count depends on most is how far the power iteration goes: Acrobot takes "
-            f"{exact} solves with exact eigenvectors; with y (maximum 1) as far as its last change, "
-            f"{', '.join(by_accuracy)}."
-        )
+            f"{exact} solves with exact eigenvectors; stopped when y (maximum 1) changes by less than a tolerance, "
+            f"{', '.join(by_accuracy)}.",
+            "A possible explanation of the published counts, not a known one (two settings of many, and counts vary "
+            f"from sample to sample): eigenvectors stopped at a few per cent, and max KL < 1e-5. {'; '.join(loose)}.",
+        ]
     closest = f"Closest of {len(fits)} settings of the scan to 28, 38, 29, 58: {name}, with {counts}"
     reading.append(
         closest + (": the published counts." if apart == 0 else f", {apart} off in sum; none gives all four.")
