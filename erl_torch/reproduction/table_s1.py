@@ -138,7 +138,8 @@ def _row(cell: Cell, result: dict[str, np.ndarray]) -> dict[str, Any]:
 
 def _by_power(exact: np.ndarray, power: np.ndarray) -> dict[str, Any]:
     return {
-        "mazes": len(power), "mean_k": power.mean(), "exact_mean_k": exact.mean(),
+        "mazes": len(power), "mean_k": power.mean(), "standard_error": power.std(ddof=1) / np.sqrt(len(power)),
+        "exact_mean_k": exact.mean(),
         "largest": np.sort(power)[-3:].tolist(), "exact_largest": np.sort(exact)[-3:].tolist(),
         "counts_that_differ": int((power != exact).sum()),
         "longer_than_any_exact": int((power > exact.max()).sum()),
