@@ -1,6 +1,6 @@
 """All 19,440 mazes of Table S1 by both rules: converged eigenvectors, and the authors' capped power iteration.
 
-    python benchmarks/table_s1_by_power.py     ten minutes on two cores; killed and started again, it goes on
+    python benchmarks/table_s1_by_power.py     a quarter of an hour on two cores; killed and started again, it goes on
 
 Prints a Markdown table; files: runs/reproduce/table_s1_by_power-full-seed0.
 """
