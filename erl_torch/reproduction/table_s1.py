@@ -187,8 +187,8 @@ def _reading(groups: dict[tuple[int, float], _Group]) -> list[str]:
         f"or after {POWER_STEPS} steps) on {len(power)} of the same mazes: longest count {power.max()} against "
         f"{exact.max()} with converged eigenvectors; {int((power > exact.max()).sum())} mazes count longer than that, "
         f"{int((power != exact).sum())} differ at all.",
-        "The authors' rule on all 19,440 mazes of seed 0 meets all twelve published means within .12, with counts of up "
-        "to 199: benchmarks/table_s1_by_power.py, docs/results/table_s1_by_power.md.",
+        "The authors' rule on all 19,440 mazes of seed 0 meets all twelve published means within .12, with counts of "
+        "up to 199: benchmarks/table_s1_by_power.py, docs/results/table_s1_by_power.md.",
     ]
 
 
