@@ -141,7 +141,7 @@ def attempt(overrides: list[str], directory: Path) -> str:
         if isinstance(error, KeyboardInterrupt):
             raise
         return f"FAILURE: {type(error).__name__}: {error}"
-    if not math.isfinite(result["objective"]):
+    if result["objective"] is None or not math.isfinite(result["objective"]):
         return f"FAILURE: objective {result['objective']}"
     return "ran"
 
