@@ -94,18 +94,20 @@ def job(work: Callable[[DictConfig, Path, Callable[[], None]], Any]) -> Callable
     def task(cfg: DictConfig) -> Any:
         hydra = HydraConfig.get()
         directory = Path(hydra.runtime.output_dir)
+        # A directory without a configuration is many runs'.
+        attempt = functools.partial(_attempt, work, cfg, directory, shared=hydra.output_subdir is None)
         if hydra.mode == RunMode.MULTIRUN:
-            return _one_of_many(functools.partial(_attempt, work, cfg, directory), hydra, directory)
+            return _one_of_many(attempt, hydra, directory)
         try:
-            return _attempt(work, cfg, directory)
+            return attempt()
         except BY_RUN as error:
             raise SystemExit(_report(error)) from error
 
     return task
 
 
-def _attempt(work: Callable[..., Any], cfg: DictConfig, directory: Path) -> Any:
-    with alone(directory):
+def _attempt(work: Callable[..., Any], cfg: DictConfig, directory: Path, shared: bool) -> Any:
+    with contextlib.nullcontext() if shared else alone(directory):
         try:
             with Signals() as signals:
                 return work(cfg, directory, signals.safe_point)

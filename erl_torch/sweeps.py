@@ -28,7 +28,7 @@ from hydra.plugins.launcher import Launcher
 from omegaconf import DictConfig
 
 from erl_torch.checks import InputError
-from erl_torch.files import write_json
+from erl_torch.files import alone, write_json
 
 EXTRAS = {"joblib": "joblib", "submitit_slurm": "slurm", "submitit_local": "slurm", "optuna": "optuna"}
 COLUMNS = ("theta", "objective", "gap", "seconds")  # of result.json
@@ -214,6 +214,8 @@ class _Patient(Launcher):
                 error = raised
             before = len(todo), len(died)
             for number in numbers:
+                if error is not None:
+                    self._wait_for_writer(number)
                 status = _read(_note(self.sweep, number)).get("status")
                 if status in OVER:
                     del todo[number]
@@ -228,6 +230,16 @@ class _Patient(Launcher):
             if error is not None and before == (len(todo), len(died)):
                 raise error
         return [self._returned(number, overrides) for number, overrides in jobs.items()]
+
+    def _wait_for_writer(self, number: int) -> None:
+        """A pool that breaks says so before the last of its processes is dead."""
+        for _ in range(300):
+            said = _read(_note(self.sweep, number))
+            if said.get("status") != "running":
+                return
+            with contextlib.suppress(InputError, FileNotFoundError), alone(self.sweep / said["directory"]):
+                return
+            time.sleep(0.1)
 
     def _returned(self, number: int, overrides: list[str]) -> JobReturn:
         value = _read(_note(self.sweep, number)).get("value")
