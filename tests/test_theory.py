@@ -82,7 +82,9 @@ def sparse_problem(seed, periodic=False, beta=None):
         p[s, 0, (s + 1) % n] += 0.3  # a cycle through all states
     p /= p.sum(-1, keepdims=True)
     beta = float(rng.uniform(0.5, 5)) if beta is None else beta
-    return rng, Dense(p, rng.standard_normal((n, n_actions)), random_policy(rng, n, n_actions) * 0.9 + 0.1 / n_actions, beta)
+    return rng, Dense(
+        p, rng.standard_normal((n, n_actions)), random_policy(rng, n, n_actions) * 0.9 + 0.1 / n_actions, beta
+    )
 
 
 # -- 1: one identity ----------------------------------------------------------------------------------------------
@@ -338,5 +340,7 @@ def test_the_page_names_tests_that_exist():
     assert len(named) > 25
     for file, name in named:
         assert f"def {name}(" in (here / (file or "test_theory.py")).read_text(), (file, name)
-    own = set(re.findall(r"^def (test_\w+)", Path(__file__).read_text(), re.M)) - {"test_the_page_names_tests_that_exist"}
+    own = set(re.findall(r"^def (test_\w+)", Path(__file__).read_text(), re.M)) - {
+        "test_the_page_names_tests_that_exist"
+    }
     assert own <= {name for file, name in named if not file}
