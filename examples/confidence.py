@@ -36,11 +36,9 @@ for s, a, drop in now.next_samples(3):
 share = np.sqrt(now.variance * now.visits)
 counts = np.random.default_rng(1).multinomial(SAMPLES, share.ravel() / share.sum())
 pairs = np.flatnonzero(counts)
-rows = mdp.transition[pairs]
-asked = [
-    np.random.default_rng(int(k)).choice(mdp.n_states, counts[k], p=mdp.transition[[k]].toarray()[0]) for k in pairs
-]
-s_next = np.concatenate(asked)
+rows = mdp.transition[pairs].toarray()  # p(.|s,a) of each
+rng = np.random.default_rng(2)
+s_next = np.concatenate([rng.choice(mdp.n_states, counts[k], p=row) for k, row in zip(pairs, rows, strict=True)])
 k = np.repeat(pairs, counts[pairs])
 targeted = erl_torch.Transitions(k // 4, k % 4, mdp.reward.ravel()[k], s_next, np.zeros(len(k), np.int64))
 more = erl_torch.collect(mdp, n_episodes=SAMPLES // 1000, episode_length=1000, seed=1)

@@ -29,8 +29,7 @@ class SoftValueIteration:
     fit, iterate = run_to_end, epochs
 
     def init(self, n_states, n_actions):
-        nothing = torch.zeros(n_states, n_actions, dtype=torch.float64)
-        return SweepState(0, 0, 0.0, nothing[:, 0], nothing)
+        return SweepState(0, 0, 0.0, torch.zeros(n_states).double(), torch.zeros(n_states, n_actions).double())
 
     def prepare(self, transitions, n_states, n_actions):
         return erl_torch.empirical_mdp(transitions, n_states, n_actions)
@@ -52,10 +51,9 @@ class SoftValueIteration:
 
 
 mdp = WindyCliffEnv().mdp
-tuples = erl_torch.collect(mdp, n_episodes=300, episode_length=1000, seed=0)
+tuples = erl_torch.collect(mdp, n_episodes=200, episode_length=1000, seed=0)
 learnt = SoftValueIteration().fit(tuples, 15, 4)
-print(
-    f"learnt by 400 sweeps over the counts of {len(tuples):,} tuples:\ntheta {learnt.theta:.5f}, gap {erl_torch.certify(learnt, mdp, 10.0).gap:.1e}"
-)
+print(f"{len(tuples):,} tuples, 400 sweeps over their counts:\ntheta {learnt.theta:.5f}")
+print(f"gap {erl_torch.certify(learnt, mdp, 10.0).gap:.1e}")
 sweep = erl_torch.Replicas.of(SoftValueIteration(), beta=[2.0, 5.0, 10.0]).fit(tuples, 15, 4)
 print("three temperatures at once:", [f"{theta:.4f}" for theta in sweep.theta])

@@ -70,7 +70,7 @@ def stationary(chain):
 
 
 def sparse_problem(seed, periodic=False, beta=None):
-    """Irreducible, few successors a pair; with ``periodic`` every step goes from one half of the states to the other."""
+    """Irreducible, few successors a pair; with ``periodic`` every step leads from odd to even or back."""
     rng = np.random.default_rng(seed)
     n, n_actions = 2 * int(rng.integers(2, 4)), int(rng.integers(2, 4))
     p = np.zeros((n, n_actions, n))
