@@ -15,9 +15,18 @@ from pathlib import Path
 from typing import Any
 
 from latex2mathml.converter import convert
+from mkdocs.structure.files import File
 
 ROOT = Path(__file__).parent.parent.parent
+ELSEWHERE = {"sweeps.md": "Sweeps and clusters", "reproduction.md": "Reproduction"}  # pages that may not be here yet
 FENCE = re.compile(r"(^```.*?^```|^ {4}.*?$)", re.M | re.S)
+
+
+def on_files(files: Any, config: Any, **_: Any) -> Any:
+    for name, title in ELSEWHERE.items():
+        if files.get_file_from_path(name) is None:
+            files.append(File.generated(config, name, content=f"# {title}\n\nTo come.\n"))
+    return files
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
