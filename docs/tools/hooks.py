@@ -53,6 +53,9 @@ def _mathml(found: re.Match[str]) -> str:
     tag, text = found[1], html.unescape(found[2]).strip()
     formula = text.removeprefix(r"\(").removeprefix(r"\[").removesuffix(r"\)").removesuffix(r"\]").strip()
     shown = convert(formula, display="block" if tag == "div" else "inline")
+    # Browsers pass over bold variants, and set no space after the name of a function.
+    shown = re.sub(r'<mn mathvariant="bold">1</mn>', "<mi>\N{MATHEMATICAL BOLD DIGIT ONE}</mi>", shown)
+    shown = re.sub(r"<mi>log</mi>(?!<mo)", '<mi>log</mi><mspace width="0.17em"/>', shown)
     return f'<{tag} class="arithmatex">{shown}</{tag}>'
 
 
