@@ -18,7 +18,12 @@ from latex2mathml.converter import convert
 from mkdocs.structure.files import File
 
 ROOT = Path(__file__).parent.parent.parent
-ELSEWHERE = {"sweeps.md": "Sweeps and clusters", "reproduction.md": "Reproduction"}  # pages that may not be here yet
+# Pages that may not be here yet.
+ELSEWHERE = {
+    "sweeps.md": "Sweeps and clusters",
+    "policies.md": "Using a learnt policy",
+    "reproduction.md": "Reproduction",
+}
 FENCE = re.compile(r"(^```.*?^```|^ {4}.*?$)", re.M | re.S)
 
 

@@ -98,16 +98,7 @@ def certify(solution: Solution, mdp: TabularMDP, beta: float, prior_policy: Any 
     """``solution``, learnt by whatever means, with the ``theta_bounds`` of ``mdp`` and its policy's own ``gap``.
 
     Solves the model: the bounds are those of ``solve_soft_bellman``, the gap is their lower end on g* less J(policy),
-    so an upper bound that is as sharp as they are narrow. ``gap`` is None where the policy's chain is not one class.
-
-    Args:
-        solution: of which the policy counts, [S, A].
-        mdp: the model to hold it against.
-        beta: inverse temperature, 1/reward, > 0.
-        prior_policy: [S, A], entries > 0; None is uniform.
-
-    Raises:
-        InputError: beta or prior out of range.
+    so an upper bound that is as sharp as they are narrow.
     """
     problem = Problem.of(mdp, beta, prior_policy)
     bounds = solve_soft_bellman(mdp, beta, prior_policy).theta_bounds
