@@ -57,6 +57,7 @@ def solve_soft_bellman(
     """The optimal entropy-regularised policy of ``mdp``, with two-sided bounds on theta*.
 
     Args:
+        mdp: the problem, on the states that its start leads to.
         beta: inverse temperature, 1/reward, > 0.
         prior_policy: [S, A], entries > 0; None is uniform.
         tol: width of the bounds to stop at, relative to the range of the rewards.
