@@ -30,6 +30,13 @@ def positive(key: str, value: float) -> None:
         raise InputError(key, value, "a finite number > 0")
 
 
+def temperature(key: str, value: float) -> None:
+    """Raise InputError unless ``value`` is an inverse temperature that leaves products in double precision."""
+    positive(key, value)
+    if not 1e-100 <= value <= 1e100:
+        raise InputError(key, value, "in [1e-100, 1e100]")
+
+
 def step_size(key: str, value: float) -> None:
     """Raise InputError unless ``value`` lies in (0, 1]."""
     if not (is_number(value) and 0 < value <= 1):

@@ -53,7 +53,7 @@ class EmpiricalMDP:
         Raises:
             InputError: beta or prior out of range, or no state that is ever returned to.
         """
-        checks.positive("beta", beta)
+        checks.temperature("beta", beta)
         prior = check_policy("prior_policy", prior_policy, self.n_states, self.n_actions)
         if not (prior > 0).all():
             s, a = np.argwhere(prior <= 0)[0]

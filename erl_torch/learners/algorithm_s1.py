@@ -192,7 +192,7 @@ class AlgorithmS1:
     device: str = "cpu"
 
     def __post_init__(self) -> None:
-        checks.positive("beta", self.beta)
+        checks.temperature("beta", self.beta)
         checks.step_size("lr_u", self.lr_u)
         if self.lr_rho is not None:
             checks.step_size("lr_rho", self.lr_rho)

@@ -223,7 +223,7 @@ class EfficientS1:
     unvisited: str = "exclude"
 
     def __post_init__(self) -> None:
-        checks.positive("beta", self.beta)
+        checks.temperature("beta", self.beta)
         checks.step_size("lr_u", self.lr_u)
         if self.lr_rho is not None:
             checks.step_size("lr_rho", self.lr_rho)
