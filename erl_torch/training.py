@@ -378,13 +378,15 @@ def _group(name: str) -> Iterator[None]:
         raise error.within(name) from error
 
 
-def make_env(cfg: DictConfig) -> gym.Env[Any, Any]:
+def make_env(cfg: DictConfig, render_mode: str | None = None) -> gym.Env[Any, Any]:
     """The environment of ``cfg``. Raises InputError."""
     keys: Any = OmegaConf.to_container(cfg, resolve=True)
     arguments = keys["kwargs"] if "kwargs" in keys else {k: v for k, v in keys.items() if k not in NOT_ARGUMENTS}
     with _group("env"):
         if isinstance(arguments.get("wind"), str):
             arguments["wind"] = read_npy(arguments["wind"], "wind")
+        if render_mode is not None:
+            arguments["render_mode"] = render_mode
         try:
             env = gym.make(cfg.id, **arguments)
         except gym.error.Error as error:
