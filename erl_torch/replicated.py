@@ -47,6 +47,7 @@ from erl_torch.training import (
     make_env,
     make_learner,
     make_world,
+    mean_return,
     recorded,
     versions,
     where,
@@ -340,8 +341,11 @@ def _exact(cfg: DictConfig, judges: _Judges, groups: list[Group]) -> list[dict[s
         best = solve_soft_bellman(model, beta, judges.prior)
         known[beta] = {}
         if best.status is Status.CONVERGED and best.theta is not None:
-            reward = judge.reward_per_step(best.policy.numpy())
-            known[beta] = {"theta": best.theta, "objective": -best.theta, "reward_per_step": reward}
+            policy = best.policy.numpy()
+            known[beta] = {"theta": best.theta, "delta_max": best.reward_bias_max, "objective": -best.theta}
+            known[beta]["reward_per_step"] = judge.reward_per_step(policy)
+            if judges.episode is not None:
+                known[beta]["return"] = mean_return(judges.episode, judges.horizon, policy)
     return [known[group.beta] for group in groups]
 
 

@@ -95,7 +95,7 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
         horizon = min(e.horizon, (env.spec and env.spec.max_episode_steps) or e.horizon)
 
         def measure(policy: torch.Tensor) -> Evaluation:
-            exact = None if world.episode is None else functools.partial(_mean_return, world.episode, horizon)
+            exact = None if world.episode is None else functools.partial(mean_return, world.episode, horizon)
             return evaluate(env, policy, learner.beta, rng.evaluation, e.n_episodes, horizon, prior, judge, exact)
 
         start = state = learner.init(n_states, n_actions)
@@ -323,7 +323,7 @@ def _optimal_tags(
             policy = best.policy.numpy()
             found["reward_per_step"] = reward_per_step(judge, policy, horizon)
             if episode is not None:
-                found["return"] = _mean_return(episode, horizon, policy)
+                found["return"] = mean_return(episode, horizon, policy)
     return {f"optimal/{name}": value for name, value in found.items()}
 
 
@@ -456,7 +456,8 @@ def episode_model(env: gym.Env[Any, Any], world: World) -> TabularMDP | None:
     return world.episode or (world.mdp if endless else None)
 
 
-def _mean_return(episode: TabularMDP, horizon: int, policy: np.ndarray) -> float:
+def mean_return(episode: TabularMDP, horizon: int, policy: np.ndarray) -> float:
+    """Expected return of an episode of at most ``horizon`` steps, which ``episode`` is the model of."""
     return horizon * reward_per_step(episode, policy, horizon)
 
 
