@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shlex
@@ -109,7 +110,7 @@ def hyperparameters(cfg: DictConfig, **more: Any) -> dict[str, int | float | str
     learner = {k: v for k, v in settings["learner"].items() if k != "name"}
     found = {"env": cfg.env.name, "learner": cfg.learner.name, **learner, **env, "seed": cfg.seed, **more}
     return {
-        key: value if isinstance(value, (int, float, str)) and not isinstance(value, bool) else str(value).lower()
+        key: value if isinstance(value, (int, float, str)) and not isinstance(value, bool) else json.dumps(value)
         for key, value in found.items()
         if value is not None and value != {}
     }

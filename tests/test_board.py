@@ -21,7 +21,7 @@ from test_config import composed
 from erl_torch import NonFiniteError, board, solve_soft_bellman
 from erl_torch.envs.windy_cliff import WindyCliffEnv
 from erl_torch.solvers import certify
-from erl_torch.training import train
+from erl_torch.training import train, where
 
 PAGE = (Path(__file__).parents[1] / "docs" / "logging.md").read_text()
 DOCUMENTED = set(re.findall(r"`([\w/]+)`", PAGE))
@@ -36,9 +36,11 @@ def events(directory):
 def undocumented(directory):
     """Tags of the run in ``directory`` that docs/logging.md does not have."""
     found = set()
-    for tag in (tag for kind in ("scalars", "images") for tag in events(directory).Tags()[kind]):
+    tags = events(directory).Tags()
+    texts = [tag.removesuffix("/text_summary") for tag in tags["tensors"] if tag.endswith("/text_summary")]
+    for tag in [*tags["scalars"], *tags["images"], *texts]:
         name = re.sub(r"^(bands|sweep)/.*", r"\1/NAME", tag)
-        if not DOCUMENTED & {name} and not re.match(r"(s1|learner|exact|eval|optimal|prior|data|Final|time)/", tag):
+        if name not in DOCUMENTED and not re.match(r"(s1|learner|exact|eval|optimal|prior|data|Final|time)/", tag):
             name = re.sub(r"^[^/]+/(.*?)_(mean|median|q25|q75|min|max|optimal|prior)$", r"GROUP/\1", tag)
         if name not in DOCUMENTED:
             found.add(tag)
@@ -110,12 +112,33 @@ def test_certificate_of_a_known_optimum():
     assert (one.gap, one.theta_bounds) == (two.gap, two.theta_bounds)
 
 
+def test_charts_are_those_that_have_data():
+    known = {"data/theta", "data/theta_lower", "data/theta_upper"}
+    charts = board.layout(["s1/theta", "eval/objective"], known)
+    assert [list(charts[title]) for title in (board.CONVERGENCE, board.BIAS, board.RETURNS)] == [
+        ["theta; theta* of the model, ends of the data's 95%", "s1/theta in its bands: proven, data's 95%"],
+        [],
+        ["objective; optimal, prior"],
+    ]
+    assert charts[board.CONVERGENCE]["s1/theta in its bands: proven, data's 95%"] == [
+        ("s1/theta",) * 3,
+        ("data/theta", "data/theta_lower", "data/theta_upper"),
+    ]
+    assert len(board.layout(["s1/theta"], [])[board.CONVERGENCE]) == 1  # no band is known
+
+
+def test_jobs_of_a_sweep_are_shown_side_by_side():
+    assert where(Path("runs/windy_cliff/sweep-1/000-seed=0"))[1] == Path("runs/windy_cliff/sweep-1")
+    assert where(Path("runs/windy_cliff/1"))[1] == "runs"
+
+
 def test_hyperparameters_are_numbers_and_text():
     found = board.hyperparameters(composed("env=frozen_lake"), n_replicas=3, vary=[1, 2])
     assert found["learner"] == "s1"
     assert found["clip_rho"] == "true"
     assert found["n_replicas"] == 3
     assert found["vary"] == "[1, 2]"
+    assert board.hyperparameters(composed("env=windy_frozen_lake", "env.desc=[SFG]"))["env.desc"] == '["SFG"]'
     assert found["env.on_end"] == "restart"
     assert not {"lr_rho", "env.suggest", "env.id", "name"} & set(found)  # lr_rho: null
 
