@@ -53,7 +53,7 @@ class EmpiricalMDP:
         Raises:
             InputError: beta or prior out of range, or no state that is ever returned to.
         """
-        checks.positive("beta", beta)
+        checks.temperature("beta", beta)
         prior = check_policy("prior_policy", prior_policy, self.n_states, self.n_actions)
         if not (prior > 0).all():
             s, a = np.argwhere(prior <= 0)[0]
@@ -123,7 +123,15 @@ class EmpiricalProblem:
 
 
 def empirical_mdp(transitions: Transitions, n_states: int, n_actions: int) -> EmpiricalMDP:
-    """Counts and mean rewards of a stream. Raises InputError naming the first tuple out of range."""
+    """Counts and mean rewards of a stream.
+
+    Args:
+        transitions: the tuples; a' is not used.
+        n_states, n_actions: sizes of the tables.
+
+    Raises:
+        InputError: naming the first tuple with a state or action out of range.
+    """
     transitions.check_range(n_states, n_actions)
     n_pairs = n_states * n_actions
     if n_pairs > np.iinfo(np.int32).max:

@@ -7,7 +7,7 @@ import fcntl
 import json
 import os
 import zipfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -84,6 +84,19 @@ def alone(directory: str | os.PathLike[str]) -> Iterator[None]:
         yield
     finally:
         os.close(descriptor)
+
+
+def write_gif(path: str | os.PathLike[str], frames: Sequence[np.ndarray], fps: float) -> Path:
+    """Write pictures [H, W, 3] uint8, ``fps`` a second, over and over; the format goes up to 50."""
+    from PIL import Image
+
+    first, *others = (Image.fromarray(frame) for frame in frames)
+    milliseconds = max(20, round(1000 / fps))
+
+    def fill(file: BinaryIO) -> None:
+        first.save(file, format="gif", save_all=True, append_images=others, duration=milliseconds, loop=0)
+
+    return _write(path, fill)
 
 
 def read_npz(path: str | os.PathLike[str], key: str = "path") -> dict[str, np.ndarray]:

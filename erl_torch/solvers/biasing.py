@@ -111,7 +111,17 @@ def iterate_biasing(
     target: TabularMDP | None = None,
     max_steps: int = 200,
 ) -> Iterator[BiasingState]:
-    """Yield every biasing iteration; ends after ``max_steps``, or when rounding ends progress."""
+    """Yield every biasing iteration; ends after ``max_steps``, or when rounding ends progress.
+
+    Nothing is yielded where the states that the start leads to are not one class.
+
+    Args:
+        mdp, beta, prior_policy, target: as in ``solve_biasing``.
+        max_steps: biasing iterations at most.
+
+    Raises:
+        InputError: an argument out of range, or a target of another shape.
+    """
     problem = _problem(mdp, beta, prior_policy, target)
     checks.at_least("max_steps", max_steps, 1)
     ref = problem.regeneration_state()
