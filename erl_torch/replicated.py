@@ -27,7 +27,7 @@ from tqdm import tqdm
 
 from erl_torch import checks, pictures
 from erl_torch.board import Board, hyperparameters, replica_layout
-from erl_torch.checkpoint import Checkpoints, digest
+from erl_torch.checkpoint import Checkpoints, columns, digest, rows_of
 from erl_torch.checks import InputError
 from erl_torch.evaluation import Judge, evaluate
 from erl_torch.experience import collect
@@ -126,7 +126,7 @@ def train_replicas(cfg: DictConfig, directory: Path, safe_point: SafePoint, save
         settings = hyperparameters(cfg, n_replicas=cfg.n_replicas, n_experience=n_experience, **varied)
         first = {} if found else judge(np.repeat(prior[None], len(replicas), axis=0), True)
         if found:
-            state, history, learning = found["state"], found["history"], found["learning"]
+            state, history, learning = found["state"], rows_of(found["history"]), found["learning"]
             record.restore(found["record"])
             judge.restore(found["evaluation"])
             began -= found["seconds"]
@@ -140,7 +140,7 @@ def train_replicas(cfg: DictConfig, directory: Path, safe_point: SafePoint, save
             def snapshot() -> dict[str, Any]:
                 return {
                     "state": state,
-                    "history": history,
+                    "history": columns(history),
                     "record": record.content(),
                     "evaluation": judge.generators(),
                     "events": board.flush(),
@@ -445,11 +445,12 @@ class _Record:
 
     def content(self) -> tuple[Any, ...]:
         """What a checkpoint keeps."""
-        return self.prior, self.steps, self.rows, self.alive
+        return self.prior, self.steps, *({k: np.stack(v) for k, v in x.items()} for x in (self.rows, self.alive))
 
     def restore(self, content: tuple[Any, ...]) -> None:
         """Go on from ``content``."""
-        self.prior, self.steps, self.rows, self.alive = content
+        self.prior, self.steps = content[:2]
+        self.rows, self.alive = ({name: list(column) for name, column in x.items()} for x in content[2:])
 
     def add(self, step: int, measured: Mapping[str, np.ndarray], board: Board, alive: np.ndarray | None = None) -> None:
         for name in QUANTITIES:

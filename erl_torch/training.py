@@ -26,7 +26,7 @@ import erl_torch
 from erl_torch import checks, kernels, pictures
 from erl_torch.board import Board, hyperparameters, layout
 from erl_torch.chains import SingularChainError
-from erl_torch.checkpoint import Checkpoints, digest
+from erl_torch.checkpoint import Checkpoints, columns, digest, rows_of
 from erl_torch.checks import InputError
 from erl_torch.config import check_keys
 from erl_torch.empirical import empirical_mdp
@@ -116,7 +116,8 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
         episode = episode_model(env, world)
         found = run.check(saved.start())
         if found:
-            state, history, first, last = (found[key] for key in ("state", "history", "first", "last"))
+            state, first, last = (found[key] for key in ("state", "first", "last"))
+            history = rows_of(found["history"])
             rng.evaluation.bit_generator.state = found["evaluation"]
             clock.seconds, began = found["learning"], began - found["seconds"]
         else:
@@ -136,7 +137,7 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
             def snapshot() -> dict[str, Any]:
                 return {
                     "state": state,
-                    "history": history,
+                    "history": columns(history),
                     "first": first,
                     "last": last,
                     "evaluation": rng.evaluation.bit_generator.state,
