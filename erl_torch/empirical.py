@@ -26,7 +26,9 @@ from erl_torch.chains import classes
 from erl_torch.checks import InputError
 from erl_torch.mdp import check_policy
 from erl_torch.solvers.problem import Problem
-from erl_torch.transitions import Transitions
+from erl_torch.transitions import Recording
+
+BLOCK = 1 << 22  # tuples a compiled call, so that signals are served several times a second
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,32 +124,110 @@ class EmpiricalProblem:
     reducible: bool  # the stream shows several closed classes; this is the most visited
 
 
-def empirical_mdp(transitions: Transitions, n_states: int, n_actions: int) -> EmpiricalMDP:
-    """Counts and mean rewards of a stream. Raises InputError naming the first tuple out of range."""
-    transitions.check_range(n_states, n_actions)
+@dataclass(frozen=True, eq=False)
+class Tally:
+    """What one pass over a stream tells, in memory for S*A pairs and the distinct (s,a,s')."""
+
+    visits: np.ndarray  # [S*A] int64
+    indptr: np.ndarray  # [S*A + 1], rows of the (s,a,s') met
+    indices: np.ndarray  # [nnz] int32, s', ascending in a row
+    counts: np.ndarray  # [nnz] int64
+    reward_given_next: np.ndarray  # mean, [nnz]
+    last_reward: np.ndarray  # of the last visit, [S*A]; 0 without visits
+    varied: bool  # a pair has had two rewards
+    reward_range: tuple[float, float]
+    psi_weight: np.ndarray  # [nnz], W of one psi epoch; 0 without lr_psi
+
+    @property
+    def psi_map(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """W as CSR [S*A, S] without the visits that have underflowed; the decay is (1 - lr_psi)**visits."""
+        kept = self.psi_weight > 0
+        indptr = np.concatenate(([0], np.cumsum(kept)))[self.indptr]
+        return indptr, self.indices[kept], self.psi_weight[kept]
+
+
+def tally(data: Recording, n_states: int, n_actions: int, lr_psi: float = 0.0) -> Tally:
+    """Count a stream, however it is cut to the same bits. Raises InputError naming the first tuple out of range."""
+    data.check_range(n_states, n_actions)
     n_pairs = n_states * n_actions
     if n_pairs > np.iinfo(np.int32).max:
         raise InputError("n_states * n_actions", n_pairs, "below 2**31")
-    pair = transitions.s * np.int32(n_actions) + transitions.a
-    visits = kernels.visit_counts(pair, n_pairs)
-    shape = (n_pairs, n_states)
-    # Both share one pattern: sums of equal (row, column) are kept even where they are 0.
-    counts = sp.coo_array((np.ones(len(pair)), (pair, transitions.s_next)), shape=shape).tocsr()
-    rewards = sp.coo_array((transitions.r, (pair, transitions.s_next)), shape=shape).tocsr()
-    for table in (counts, rewards):
-        table.sum_duplicates()
+    pairs = np.zeros(n_pairs, np.int64), np.zeros(n_pairs), np.ones(n_pairs), np.full(n_pairs, -1, np.int64)
+    visits, reward, scale, newest = pairs
+    size, used = 512, 0
+    keys, older, counts = (np.empty(size, np.int64), np.empty(size, np.int64), np.zeros(size, np.int64))
+    totals, weight = np.zeros(size), np.zeros(size)
+    table, shift = _table(keys, 0, 2 * size)
+    varied, smallest, largest = False, np.inf, -np.inf
+    for chunk in data.chunks():
+        pair = chunk.s * np.int32(n_actions) + chunk.a
+        done = 0
+        while done < len(chunk):
+            if used == size:
+                size *= 2
+                keys, older, counts, totals, weight = (_longer(x, size) for x in (keys, older, counts, totals, weight))
+                table, shift = _table(keys, used, 2 * size)
+            part = slice(min(len(chunk), done + BLOCK))
+            done, used, changed, low, high = kernels.tally(
+                pair[part], chunk.s_next[part], chunk.r[part], n_states, lr_psi, shift, table, keys, older, newest,
+                counts, totals, weight, visits, reward, scale, used, done,
+            )  # fmt: skip
+            varied, smallest, largest = varied or changed, min(smallest, low), max(largest, high)
+    order = np.argsort(keys[:used])
+    row, indices = np.divmod(keys[:used][order], n_states)
+    return Tally(
+        visits=visits,
+        indptr=np.concatenate(([0], np.cumsum(np.bincount(row, minlength=n_pairs)))),
+        indices=indices.astype(np.int32),
+        counts=counts[order],
+        reward_given_next=totals[order] / counts[order],
+        last_reward=reward,
+        varied=varied,
+        reward_range=(float(smallest), float(largest)),
+        psi_weight=weight[order] * scale[row],
+    )
+
+
+def _longer(column: np.ndarray, size: int) -> np.ndarray:
+    longer = np.zeros(size, column.dtype)
+    longer[: len(column)] = column
+    return longer
+
+
+def _table(keys: np.ndarray, used: int, size: int) -> tuple[np.ndarray, int]:
+    """(hash table [size] of the entries, shift), for ``kernels.tally``; size a power of two."""
+    table = np.full(size, -1, np.int64)
+    shift = 65 - size.bit_length()
+    kernels.enter(table, keys, used, shift)
+    return table, shift
+
+
+def empirical_mdp(data: Recording, n_states: int, n_actions: int, found: Tally | None = None) -> EmpiricalMDP:
+    """Counts and mean rewards of a stream (``found``: its tally, where there is one).
+
+    One pass, and two more where rewards vary. Raises InputError naming the first tuple out of range.
+    """
+    found = found or tally(data, n_states, n_actions)
+    visits, base = found.visits, found.last_reward
     n = np.maximum(visits, 1)
-    # Around the first reward of each pair, so that a constant reward has exactly itself as mean.
-    base = np.zeros(n_pairs)
-    base[pair] = transitions.r
-    reward = base + np.bincount(pair, transitions.r - base[pair], n_pairs) / n
-    squares = np.bincount(pair, (transitions.r - reward[pair]) ** 2, n_pairs)
+    # Around one reward of each pair, so that a constant reward has exactly itself as mean.
+    off, squares = np.zeros(len(visits)), np.zeros(len(visits))
+    reward = base + off
+    if found.varied:
+        for chunk in data.chunks():
+            pair = chunk.s * np.int32(n_actions) + chunk.a
+            np.add.at(off, pair, chunk.r - base[pair])
+        reward = base + off / n
+        for chunk in data.chunks():
+            pair = chunk.s * np.int32(n_actions) + chunk.a
+            np.add.at(squares, pair, (chunk.r - reward[pair]) ** 2)
+    rows = np.diff(found.indptr)
     return EmpiricalMDP(
         visits=visits.reshape(n_states, n_actions),
         transition=sp.csr_array(
-            (counts.data / np.repeat(n, np.diff(counts.indptr)), counts.indices, counts.indptr), shape
+            (found.counts / np.repeat(n, rows), found.indices, found.indptr), shape=(len(visits), n_states)
         ),
         reward=reward.reshape(n_states, n_actions),
         reward_variance=(squares / np.maximum(visits - 1, 1)).reshape(n_states, n_actions),
-        reward_given_next=rewards.data / counts.data,
+        reward_given_next=found.reward_given_next,
     )

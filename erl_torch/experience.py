@@ -16,7 +16,9 @@ real transitions enter the stream.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -27,6 +29,7 @@ from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.mdp import TabularMDP, check_policy
 from erl_torch.models import changed_by, known_mdp, sizes
+from erl_torch.recordings import ColumnWriter, save_columns
 from erl_torch.rng import Streams, streams
 from erl_torch.sampling import Sampler
 from erl_torch.transitions import Transitions
@@ -81,6 +84,43 @@ def collect(
     return _step_through(source, n_episodes, episode_length, rng, behaviour, prior, on_prior, report)
 
 
+def record(
+    source: TabularMDP | gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any],
+    directory: str | os.PathLike[str],
+    n_episodes: int,
+    episode_length: int,
+    seed: int | Streams = 0,
+    behaviour_policy: Any = None,
+    prior_policy: Any = None,
+    report: Report | None = None,
+) -> Path:
+    """Write what ``collect`` gives to a directory of columns (``erl_torch.open_recording`` reads it).
+
+    Of a TabularMDP, or an environment that follows one, in memory of a block of tuples, whatever the length.
+
+    Raises:
+        InputError: as ``collect``; a directory that holds anything else.
+    """
+    mdp = known_mdp(source)
+    if mdp is None:
+        data = collect(source, n_episodes, episode_length, seed, behaviour_policy, prior_policy, report)
+        return save_columns(data, directory)
+    checks.at_least("n_episodes", n_episodes, 1)
+    checks.at_least("episode_length", episode_length, 1)
+    prior = check_policy("prior_policy", prior_policy, *mdp.reward.shape)
+    on_prior = behaviour_policy is None
+    behaviour = prior if on_prior else check_policy("behaviour_policy", behaviour_policy, *mdp.reward.shape)
+    rng = seed if isinstance(seed, Streams) else streams(seed)
+    done = 0
+    with ColumnWriter(directory) as writer:
+        for blocks in _blocks(mdp, n_episodes * episode_length, episode_length, rng, behaviour, prior, on_prior):
+            writer.append(of_pairs(*blocks, mdp.reward))
+            done += len(blocks[0])
+            if report is not None:
+                report(done)
+    return writer.directory
+
+
 def batched(env: gym.Env[Any, Any]) -> Callable[..., Transitions] | None:
     """``collect`` of an environment that can play many episodes at once, if it is not wrapped in something else."""
     play = getattr(env.unwrapped, "collect", None)
@@ -107,14 +147,29 @@ def _simulate(
 ) -> Transitions:
     n = n_episodes * episode_length
     pair, pair_next = np.empty(n, np.int32), np.empty(n, np.int32)
+    done = 0
+    for here, there in _blocks(mdp, n, episode_length, rng, behaviour, prior, on_prior):
+        pair[done : done + len(here)], pair_next[done : done + len(here)] = here, there
+        done += len(here)
+        report(done)
+    return of_pairs(pair, pair_next, mdp.reward)
+
+
+def _blocks(
+    mdp: TabularMDP,
+    n: int,
+    episode_length: int,
+    rng: Streams,
+    behaviour: np.ndarray,
+    prior: np.ndarray,
+    on_prior: bool,
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """``n`` tuples as (pair, pair_next), a block at a time."""
     sampler = Sampler(mdp, [rng], episode_length, behaviour, prior, on_prior)
     for begin in range(0, n, BLOCK):
-        part = slice(begin, min(n, begin + BLOCK))
-        here, _, there = sampler.take(part.stop - begin)
-        pair[part], pair_next[part] = here[:, 0], there[:, 0]
-        report(part.stop)
+        here, _, there = sampler.take(min(n, begin + BLOCK) - begin)
+        yield here[:, 0], there[:, 0]
     sampler.give_back()
-    return of_pairs(pair, pair_next, mdp.reward)
 
 
 def of_pairs(pair: np.ndarray, pair_next: np.ndarray, reward: np.ndarray) -> Transitions:
