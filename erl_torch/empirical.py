@@ -214,13 +214,17 @@ def empirical_mdp(data: Recording, n_states: int, n_actions: int, found: Tally |
     off, squares = np.zeros(len(visits)), np.zeros(len(visits))
     reward = base + off
     if found.varied:
-        for chunk in data.chunks():
-            pair = chunk.s * np.int32(n_actions) + chunk.a
-            np.add.at(off, pair, chunk.r - base[pair])
-        reward = base + off / n
-        for chunk in data.chunks():
-            pair = chunk.s * np.int32(n_actions) + chunk.a
-            np.add.at(squares, pair, (chunk.r - reward[pair]) ** 2)
+        with np.errstate(over="ignore", invalid="ignore"):
+            for chunk in data.chunks():
+                pair = chunk.s * np.int32(n_actions) + chunk.a
+                np.add.at(off, pair, chunk.r - base[pair])
+            reward = base + off / n
+            for chunk in data.chunks():
+                pair = chunk.s * np.int32(n_actions) + chunk.a
+                np.add.at(squares, pair, (chunk.r - reward[pair]) ** 2)
+        if not np.isfinite(squares).all():
+            low, high = found.reward_range
+            raise InputError("r", f"between {low:g} and {high:g}", "of a size whose squares are finite numbers")
     rows = np.diff(found.indptr)
     return EmpiricalMDP(
         visits=visits.reshape(n_states, n_actions),
