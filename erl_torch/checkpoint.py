@@ -53,13 +53,14 @@ class Checkpoints:
         self._check(directory / "settings.json")
 
     def start(self) -> dict[str, Any] | None:
-        """What the newest checkpoint that can be read holds; None where there is none: the run begins.
-
-        Takes possession of the directory: leftovers of a killed run go.
-        """
+        """Take possession of the directory (leftovers of a killed run go), and ``read``; None: the run begins."""
         write_json(self.directory / "settings.json", self._settings)
         for leftover in (*self.directory.glob(".*.tmp"), *self._folder.glob(".*.tmp")):
             leftover.unlink(missing_ok=True)
+        return self.read()
+
+    def read(self) -> dict[str, Any] | None:
+        """The newest checkpoint that can be read; those that cannot go, with a warning."""
         for path in sorted(self._folder.glob("*.ckpt"), reverse=True):
             try:
                 found = _read(path, self.device)

@@ -63,7 +63,7 @@ class Signals:
     def _note(self, number: int, frame: Any) -> None:
         self.received = number
         signal.signal(number, signal.SIG_DFL)
-        print("\nstopping after this epoch; what is learnt will be saved", file=sys.stderr)
+        print("\nstopping at the next safe point; what is done will be saved", file=sys.stderr)
 
 
 def job(work: Callable[[DictConfig, Path, Callable[[], None]], Any]) -> Callable[[DictConfig], Any]:
@@ -166,7 +166,13 @@ def _help(about: str, conf: Path, config_name: str, overrides: list[str]) -> str
         for group in sorted(conf.iterdir())
         if group.is_dir() and "name" in (cfg.get(group.name) or {})
     ]
-    head = [about.rstrip(), "", "Choices:", *choices, "", "Keys and values (each is explained in conf/):", ""]
+    head = [
+        about.rstrip(),
+        "",
+        *(["Choices:", *choices, ""] if choices else []),
+        "Keys and values (each is explained in conf/):",
+        "",
+    ]
     return "\n".join(head) + "\n" + OmegaConf.to_yaml(cfg).rstrip()
 
 

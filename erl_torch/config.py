@@ -302,6 +302,14 @@ class Compare:
     learner: dict[str, Any] = MISSING
 
 
+@dataclass
+class Reproduce:
+    artifact: str = MISSING
+    scale: str = "quick"
+    seed: int = 0
+    processes: int = 2
+
+
 SCHEMAS: dict[str, dict[str, type]] = {
     "env": {
         "windy_cliff": WindyCliff,
@@ -354,6 +362,7 @@ def register() -> None:
             store.store(group=f"schema/{group}", name=name, node=schema)
     store.store(group="schema", name="train", node=Train)
     store.store(group="schema", name="compare", node=Compare)
+    store.store(group="schema", name="reproduce", node=Reproduce)
     OmegaConf.register_new_resolver("slug", slug, replace=True)
     OmegaConf.register_new_resolver("run_name", run_name, replace=True)
 
@@ -370,6 +379,11 @@ def check_comparison_keys(cfg: DictConfig) -> None:
         if name not in SCHEMAS["learner"]:
             raise InputError(f"learner.{name}", "", f"left out: the learners are {', '.join(SCHEMAS['learner'])}")
         _check_node(cfg.learner[name], SCHEMAS["learner"][name], f"learner.{name}.")
+
+
+def check_reproduction_keys(cfg: DictConfig) -> None:
+    """``check_keys`` for ``conf/reproduce.yaml``."""
+    _check_node(cfg, Reproduce, "")
 
 
 def _check_node(node: DictConfig, schema: Any, prefix: str) -> None:

@@ -19,6 +19,7 @@ from erl_torch.checks import InputError
 from erl_torch.files import read_npz, write_npz
 
 ROW_SUM_TOLERANCE = 1e-9
+LARGEST_REWARD = 1e100  # products of such numbers stay in range
 CSR_PARTS = ("indptr", "indices", "data")
 
 
@@ -46,9 +47,10 @@ class TabularMDP:
         if reward.ndim != 2 or 0 in reward.shape:
             raise InputError("reward", f"array of shape {reward.shape}", "of shape [n_states, n_actions]")
         n_states, n_actions = reward.shape
-        if not np.isfinite(reward).all():
-            s, a = np.argwhere(~np.isfinite(reward))[0]
-            raise InputError(f"reward[{s}, {a}]", reward[s, a], "finite")
+        usable = np.abs(reward) <= LARGEST_REWARD  # false for NaN
+        if not usable.all():
+            s, a = np.argwhere(~usable)[0]
+            raise InputError(f"reward[{s}, {a}]", reward[s, a], f"finite, and at most {LARGEST_REWARD:g} in size")
         transition = _csr(self.transition, n_states, n_actions)
         _check_rows(transition, n_actions)
         start = np.full(n_states, 1.0 / n_states) if self.start is None else _dense("start", self.start)

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PolyCollection
-from matplotlib.colors import LinearSegmentedColormap, to_rgb
+from matplotlib.colors import LinearSegmentedColormap, Normalize, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
@@ -58,18 +58,38 @@ def grid_picture(
     An arrow is as long as its action's probability, a dot as wide where the action is to stay. ``scale`` gives more
     pixels, for print, to the same drawing.
     """
-    shaded = distribution is not None
-    figure, axes = _grid_axes(grid, title, max_px, bar=shaded)
-    _tiles(axes, grid)
+    figure, axes = _grid_axes(grid, title, max_px, bar=distribution is not None)
+    draw_grid(axes, grid, policy, distribution)
     if distribution is not None:
-        shades = LinearSegmentedColormap.from_list("share of time", [(*to_rgb(SHARE), 0.0), (*to_rgb(SHARE), 1.0)])
-        image = axes.imshow(distribution.reshape(grid.shape), cmap=shades, vmin=0, zorder=1.2)
-        _bar(figure, image, "share of time")
-    _wind(axes, grid)
-    if policy is not None:
-        _policy(axes, grid, policy)
+        _bar(figure, shares(float(distribution.max())), "share of time")
     figure.set_dpi(DPI * scale)
     return _pixels(figure)
+
+
+def draw_grid(
+    axes: Axes,
+    grid: GridWorld,
+    policy: np.ndarray | None = None,
+    distribution: np.ndarray | None = None,
+    top: float | None = None,
+    wind: bool = True,
+) -> None:
+    """``grid_picture``'s drawing on ``axes``; ``top`` is the share of time with the full colour, None the largest."""
+    _frame(axes, grid)
+    _tiles(axes, grid)
+    if distribution is not None:
+        top = float(distribution.max()) if top is None else top
+        axes.imshow(distribution.reshape(grid.shape), cmap=shares(top).get_cmap(), vmin=0, vmax=top, zorder=1.2)
+    if wind:
+        _wind(axes, grid)
+    if policy is not None:
+        _policy(axes, grid, policy)
+
+
+def shares(top: float) -> ScalarMappable:
+    """The colours of shares of time from 0 to ``top``, for a colour bar."""
+    colours = LinearSegmentedColormap.from_list("share of time", [(*to_rgb(SHARE), 0.0), (*to_rgb(SHARE), 1.0)])
+    return ScalarMappable(Normalize(0.0, top), colours)
 
 
 def bias_picture(

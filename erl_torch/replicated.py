@@ -329,7 +329,7 @@ class _Judges:
             print("note: a large model (evaluation.exact_up_to): episodes are played instead", file=sys.stderr)
         # An episode's return is the model's where the environment is the model.
         endless = known_mdp(env) is not None and not getattr(env.unwrapped, "ends", np.zeros(1)).any()
-        self.episode = world.episode or (world.mdp if endless else None)
+        self.episode = None if self.model is None else world.episode or (world.mdp if endless else None)
 
     def generators(self) -> list[Any]:
         """States of the generators that play episodes."""

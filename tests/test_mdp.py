@@ -79,6 +79,7 @@ def changed(array, index, value):
         ),
         ((FLAT[:5], R), r"transition=array of shape \(5, 3\): must be of shape \[6, 3\]"),
         ((P, changed(R, (1, 0), np.inf)), r"reward\[1, 0\]=inf: must be finite"),
+        ((P, changed(R, (1, 0), -1e300)), r"reward\[1, 0\]=-1e\+300: must be finite, and at most 1e\+100 in size"),
         ((P, R.ravel()), r"reward=array of shape \(6,\): must be of shape \[n_states, n_actions\]"),
         ((P, "reward"), r"reward=str: must be an array of numbers"),
         ((P, R, [0.5, 0.5]), r"start=array of shape \(2,\): must be of shape \[3\]"),

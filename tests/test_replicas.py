@@ -361,6 +361,7 @@ def test_replica_of_a_run_is_the_run_of_its_seed(finished, tmp_path):
         "bands.png",
         "replicas.npz",
         "result.json",
+        "settings.json",
     ]
     assert json.loads((directory / "result.json").read_text()) == result
     replicas = ReplicaSolution.load(directory / "replicas.npz")
@@ -422,6 +423,15 @@ def test_improved_learner_on_a_recorded_stream(tmp_path):
     data = Transitions.load(tmp_path / "t.npz")
     for group, beta in zip(result["groups"], (1, 2, 4), strict=True):
         assert group["theta"]["mean"] == LEARNERS["s1_efficient"](beta=beta).fit(data, 4, 2).theta
+
+
+def test_a_model_too_large_is_judged_by_playing(tmp_path):
+    large = ("evaluation.exact_up_to=1", "evaluation.n_episodes=2", "evaluation.horizon=20")
+    few = ("experience.n_episodes=2", "experience.episode_length=100", "learner.n_epochs=2", "learner.n_bias=3")
+    result = train(composed("env=frozen_lake", *few, *large, "n_replicas=2"), tmp_path)
+    assert np.isfinite(result["objective"])
+    assert result["groups"][0]["exact"] == {}
+    assert [e.step for e in events(tmp_path).Scalars("replicas/return_mean")] == [0, 400, 800, 1200]
 
 
 def test_a_failed_replica_ends_the_run_with_a_line_after_all_is_written(tmp_path):

@@ -39,7 +39,7 @@ def test_run_directory(finished):
     directory, result = finished
     names = sorted(p.name for p in directory.iterdir())
     assert names[0].startswith("events.out.tfevents")
-    assert names[1:] == ["result.json", "solution.npz"]
+    assert names[1:] == ["result.json", "settings.json", "solution.npz"]
     assert json.loads((directory / "result.json").read_text()) == result
     assert result["status"] == "completed"
     assert result["n_experience"] == 20_000

@@ -114,6 +114,8 @@ class ActionValueLearner:
         InputError: an argument out of its range.
     """
 
+    stream_bytes: ClassVar[int] = 28  # a tuple in a prepared stream: columns, pairs
+
     beta: float = 10.0
     power: float = 0.6
     n_epochs: int = 15

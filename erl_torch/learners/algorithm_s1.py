@@ -62,6 +62,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -190,6 +191,8 @@ class AlgorithmS1:
     Raises:
         InputError: an argument out of its range.
     """
+
+    stream_bytes: ClassVar[int] = 32  # a tuple in a prepared stream: columns, pairs
 
     beta: float = 10.0
     lr_u: float = 0.005

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -80,6 +81,8 @@ class CertaintyEquivalence:
     Raises:
         InputError: an argument out of its range.
     """
+
+    stream_bytes: ClassVar[int] = 1  # a tuple in a prepared stream: counts alone
 
     beta: float = 10.0
     tol: float = 1e-10

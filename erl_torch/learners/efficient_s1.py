@@ -59,7 +59,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import scipy.sparse as sp
@@ -195,6 +195,8 @@ class EfficientS1:
     Raises:
         InputError: an argument out of its range.
     """
+
+    stream_bytes: ClassVar[int] = 8  # a tuple in a prepared stream: pairs
 
     beta: float = 10.0
     lr_u: float = 0.005

@@ -1,0 +1,228 @@
+"""The runner behind ``reproduce.py``: units of work, kept one file each, and the final files made of them.
+
+For every artifact the folder ``<artifact>-<scale>-seed<seed>`` holds
+
+    units/NAME.npz    what ``work`` made of a unit, with the settings behind it
+    NAME.csv .json    the numbers; published against ours
+    NAME.png .svg     the picture
+
+A unit's file is written under a temporary name and renamed, so that a run killed at any moment leaves whole units or
+none; started again, it does the missing ones. A file that is damaged, or of other settings or another version of the
+artifact, is done anew. Final files are functions of the unit files alone, with no clock in them: byte for byte the
+same, however often the run was interrupted and however many processes took part.
+
+An artifact is a module with an ``ARTIFACT``: see ``artifact.py`` for the interface, ``figure_4.py`` for a short
+example. Artifacts that share units (``units_of``) have them done once.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import io
+import json
+import multiprocessing
+import multiprocessing.connection
+import os
+import re
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import matplotlib as mpl
+import numpy as np
+import torch
+from omegaconf import DictConfig
+from tqdm import tqdm
+
+from erl_torch import checks
+from erl_torch.checks import InputError
+from erl_torch.config import check_reproduction_keys
+from erl_torch.files import read_npz, write_bytes, write_json, write_npz
+from erl_torch.reproduction import ARTIFACTS, SCALES, load
+from erl_torch.reproduction.artifact import PAPER, Artifact, Output
+
+DPI = 130
+FINGERPRINT = "fingerprint"
+
+
+class _Unit(NamedTuple):
+    path: Path
+    fingerprint: str
+    work: Callable[..., Any]
+    settings: dict[str, Any]
+
+
+def reproduce(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lambda: None) -> dict[str, Output]:
+    """Run ``cfg`` (as composed from ``conf/reproduce.yaml``); prints the summary. Raises InputError."""
+    check_reproduction_keys(cfg)
+    checks.one_of("artifact", cfg.artifact, (*ARTIFACTS, "all"))
+    checks.one_of("scale", cfg.scale, SCALES)
+    checks.at_least("seed", cfg.seed, 0)
+    checks.at_least("processes", cfg.processes, 1)
+    torch.set_num_threads(1)
+    names = list(ARTIFACTS) if cfg.artifact == "all" else [cfg.artifact]
+    outputs = run([load(name) for name in names], directory, cfg.scale, cfg.seed, cfg.processes, safe_point)
+    for name, output in outputs.items():
+        folder = _folder(directory, name, cfg.scale, cfg.seed).resolve()
+        with contextlib.suppress(ValueError):
+            folder = folder.relative_to(Path.cwd())
+        print(f"\n{summary(load(name), output)}\n  files: {folder}")
+    return outputs
+
+
+def run(
+    artifacts: Sequence[Artifact],
+    directory: Path,
+    scale: str,
+    seed: int = 0,
+    processes: int = 1,
+    safe_point: Callable[[], None] = lambda: None,
+) -> dict[str, Output]:
+    """Do the missing units of ``artifacts`` and write their final files under ``directory``.
+
+    ``safe_point`` is called between units, and now and then while processes work; it may raise to end the run.
+    """
+    units = {a.name: _units(a, directory, scale, seed) for a in artifacts}
+    every = {unit.path: unit for its in units.values() for unit in its.values()}
+    done = {path for path, unit in every.items() if _kept(unit) is not None}
+    todo = [unit for path, unit in every.items() if path not in done]
+    outputs: dict[str, Output] = {}
+
+    def finish() -> None:
+        """Write what has all its units."""
+        for a in artifacts:
+            its = units[a.name]
+            if a.name in outputs or not {unit.path for unit in its.values()} <= done:
+                continue
+            results = {name: _kept(unit) for name, unit in its.items()}
+            if all(result is not None for result in results.values()):
+                outputs[a.name] = a.assemble(results, scale)  # type: ignore[arg-type]
+                _write(a, outputs[a.name], _folder(directory, a.name, scale, seed), scale, seed)
+
+    finish()
+    with tqdm(
+        total=len(every), initial=len(done), desc="reproducing", unit=" units", disable=None,
+        bar_format="{l_bar}{bar:20}| {n_fmt}/{total_fmt}{unit}, {elapsed}<{remaining}",
+    ) as bar:  # fmt: skip
+        for unit, values in _each(todo, processes, safe_point):
+            write_npz(unit.path, {**values, FINGERPRINT: unit.fingerprint})
+            done.add(unit.path)
+            bar.update()
+            finish()
+    return {a.name: outputs[a.name] for a in artifacts}
+
+
+def summary(its: Artifact, output: Output) -> str:
+    """Published, ours and verdict, a line each."""
+    cells = [("", "published", "ours", "verdict")]
+    for c in output.comparisons:
+        mark = "" if c.source == PAPER else f" ({c.source})"
+        cells.append((c.quantity, _cell(c.published), _cell(c.ours), c.verdict + mark))
+    widths = [max(len(row[i]) for row in cells) for i in range(4)]
+    lines = [f"  {a:{widths[0]}}  {b:>{widths[1]}}  {c:>{widths[2]}}  {d}" for a, b, c, d in cells]
+    return "\n".join([f"{its.name}: {its.title}", *lines, f"  {output.verdict}"])
+
+
+# -- units ------------------------------------------------------------------------------------------------
+
+
+def _folder(directory: Path, name: str, scale: str, seed: int) -> Path:
+    return directory / f"{name}-{scale}-seed{seed}"
+
+
+def _units(a: Artifact, directory: Path, scale: str, seed: int) -> dict[str, _Unit]:
+    folder = _folder(directory, a.units_of or a.name, scale, seed) / "units"
+    units = {}
+    for name, settings in a.units(scale, seed).items():
+        if not re.fullmatch(r"[\w.+=-]{1,100}", name):
+            raise ValueError(f"{name!r} is no name for the file of a unit")
+        # The work is named, so that artifacts that share units must mean the same by them.
+        about = {"work": f"{a.work.__module__}.{a.work.__qualname__}", "version": a.version, "settings": settings}
+        units[name] = _Unit(folder / f"{name}.npz", json.dumps(about, sort_keys=True), a.work, settings)
+    return units
+
+
+def _kept(unit: _Unit) -> dict[str, np.ndarray] | None:
+    """What the unit's file holds; None if it is missing, damaged, or of other settings."""
+    try:
+        arrays = read_npz(unit.path)
+    except InputError:
+        return None
+    return arrays if str(arrays.pop(FINGERPRINT, "")) == unit.fingerprint else None
+
+
+def _each(units: list[_Unit], processes: int, safe_point: Callable[[], None]) -> Iterator[tuple[_Unit, dict[str, Any]]]:
+    """(unit, its result), as they are done."""
+    if processes == 1 or len(units) < 2:
+        for unit in units:
+            safe_point()
+            yield unit, unit.work(**unit.settings)
+        return
+    # spawn: a fork would copy the threads of torch and Numba in whatever state they are.
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(min(processes, len(units)), mp_context=context, initializer=_start_worker)
+    try:
+        futures = {pool.submit(unit.work, **unit.settings): unit for unit in units}
+        while futures:
+            ready, _ = wait(futures, timeout=0.5, return_when=FIRST_COMPLETED)
+            for future in ready:
+                yield futures.pop(future), dict(future.result())
+            safe_point()
+    except BaseException:
+        for process in multiprocessing.active_children():
+            process.terminate()
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _start_worker() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends the work
+    torch.set_num_threads(1)
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def follow() -> None:
+        multiprocessing.connection.wait([parent.sentinel])
+        os._exit(1)
+
+    # A killed parent cannot end its workers, which would wait for more work for ever.
+    threading.Thread(target=follow, daemon=True).start()
+
+
+# -- final files ------------------------------------------------------------------------------------------
+
+
+def _write(its: Artifact, output: Output, folder: Path, scale: str, seed: int) -> None:
+    table = io.StringIO(newline="")
+    writer = csv.DictWriter(table, list(output.rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(output.rows)
+    write_bytes(folder / f"{its.name}.csv", table.getvalue().encode())
+    for kind in ("png", "svg"):
+        picture = io.BytesIO()
+        # Ids by hash, no date, no version: the same picture is the same file.
+        metadata = {"Software": None} if kind == "png" else {"Date": None, "Creator": None}
+        with mpl.rc_context({"svg.hashsalt": "erl_torch"}):
+            output.figure.savefig(picture, format=kind, dpi=DPI, metadata=metadata)
+        write_bytes(folder / f"{its.name}.{kind}", picture.getvalue())
+    about = {
+        "artifact": its.name,
+        "title": its.title,
+        "command": f"python reproduce.py artifact={its.name} scale={scale} seed={seed}",
+        "verdict": output.verdict,
+        "reading": list(output.reading),
+        "published_against_ours": [c._asdict() for c in output.comparisons],
+        **output.data,
+    }
+    write_json(folder / f"{its.name}.json", about)
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, (list, tuple)):
+        return "[" + ", ".join(map(_cell, value)) + "]"
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,241 @@
+"""Table S2: how many biasing iterations the discretised control tasks take, and what could explain the published k.
+
+k counts eigen-solves, the first included. The published counts follow from neither published script; the scan here
+varies everything that a count depends on: the stop rule and its threshold, counting from 0 or 1, the damping of the
+bias update, unconverged eigenvectors (power iteration cut off), the number of samples and their seed.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from erl_torch.envs.control import control_task
+from erl_torch.pictures import COLOURS
+from erl_torch.reproduction.artifact import (
+    IN_DISTRIBUTION,
+    NOT_REPRODUCED,
+    ORACLE,
+    REPRODUCED,
+    Artifact,
+    Comparison,
+    Output,
+    Results,
+    Units,
+)
+from erl_torch.reproduction.control import EPISODES, SAMPLES, TASKS, work
+
+PUBLISHED = {"pendulum": 28, "mountain_car": 38, "cart_pole": 29, "acrobot": 58}
+BY_SCRIPT = {"pendulum": 15, "mountain_car": 30, "cart_pole": 20, "acrobot": 35}  # of May 2022
+VARIES = 3  # solves from one sample to another: "a few"
+THETA = {"pendulum": 3.331, "mountain_car": 0.0576, "cart_pole": 0.170}
+QUICK_SAMPLES = 50
+# rule: (quantity, threshold); the first two are the scripts'.
+RULES = {
+    "max KL < 1e-6": ("kl", 1e-6),
+    "change of chi < 1e-4": ("chi_change", 1e-4),
+    "max KL < 1e-2": ("kl", 1e-2),
+    "max KL < 1e-3": ("kl", 1e-3),
+    "max KL < 1e-4": ("kl", 1e-4),
+    "max KL < 1e-5": ("kl", 1e-5),
+    "max KL < 1e-7": ("kl", 1e-7),
+    "max KL < 1e-8": ("kl", 1e-8),
+    "change of chi < 1e-2": ("chi_change", 1e-2),
+    "change of chi < 1e-3": ("chi_change", 1e-3),
+}
+SCAN: dict[str, dict[str, Any]] = {
+    **{f"damping{d}": {"damping": d} for d in (0.9, 0.75, 0.6, 0.5)},
+    **{f"tolerance{t}": {"tolerance": float(t)} for t in ("1e-10", "1e-6", "1e-4", "1e-3", "1e-2", "3e-2", "4e-2")},
+    **{f"power{n}": {"most_power_steps": n} for n in (5, 10, 20, 50)},
+    **{f"samples{n}": {"n_samples": n} for n in (50, 1000)},
+}
+LABELS = {
+    "sample": "other seeds of the samples",
+    "samples": "50 or 1000 samples",
+    "damping": "damped update, .9 to .5",
+    "tolerance": "power iteration to 1e-10 ... 4e-2",
+    "power": "5 to 50 power steps a solve",
+}
+SEEDS = 5  # samples of the settings as published
+# Acrobot's runs take half a minute each, with a stronger damping four.
+ACROBOT_SCAN = (
+    "damping0.75", "tolerance1e-10", "tolerance1e-4", "tolerance1e-3", "tolerance1e-2", "tolerance3e-2",
+    "tolerance4e-2", "power5", "power10", "power20", "samples50",
+)  # fmt: skip
+ACROBOT_SEEDS = 2
+
+
+def samples(scale: str) -> int:
+    """Samples of each (s,a)."""
+    return SAMPLES if scale == "full" else QUICK_SAMPLES
+
+
+def published_units(scale: str, seed: int) -> Units:
+    """The four tasks as the paper has them; their policies are also played."""
+    return {
+        f"{task}-as_published": {"task": task, "n_samples": samples(scale), "seed": seed, "episodes": EPISODES}
+        for task in reversed(TASKS)
+    }
+
+
+def units(scale: str, seed: int) -> Units:
+    its = published_units(scale, seed)
+    if scale == "full":
+        for task in reversed(TASKS):
+            small = task != "acrobot"
+            base = {"task": task, "n_samples": SAMPLES, "seed": seed}
+            more = SEEDS if small else ACROBOT_SEEDS
+            its |= {f"{task}-sample{i}": base | {"seed": seed + i} for i in range(1, more)}
+            its |= {f"{task}-{name}": base | change for name, change in SCAN.items() if small or name in ACROBOT_SCAN}
+    return its
+
+
+def solves(result: dict[str, np.ndarray], rule: str) -> int | None:
+    """1-based count of the eigen-solve after which ``rule`` holds."""
+    name, threshold = RULES[rule]
+    met = np.flatnonzero(result[name] < threshold)
+    return int(met[0]) + 1 if met.size else None
+
+
+def assemble(results: Results, scale: str) -> Output:
+    found: dict[str, dict[str, dict[str, np.ndarray]]] = {task: {} for task in TASKS}
+    for name, result in results.items():
+        task, variant = name.split("-", 1)
+        found[task][variant] = result
+    rows = [
+        {
+            "environment": TASKS[task], "variant": variant, "rule": rule, "solves": count,
+            "bias_updates": None if count is None else count - 1, "published_k": PUBLISHED[task],
+        }
+        for task in TASKS for variant, result in found[task].items()
+        for rule in RULES for count in [solves(result, rule)]
+    ]  # fmt: skip
+    fits = _fits(found)
+    comparisons = [c for task in TASKS for c in _comparisons(task, found[task])]
+    best = [
+        {"setting": name, "counts": counts, "sum_of_differences": difference} for difference, name, counts in fits[:5]
+    ]
+    return Output(rows, comparisons, _figure(found, scale), _reading(fits, found), {"closest_settings": best})
+
+
+def _fits(found: dict[str, dict[str, Any]]) -> list[tuple[int, str, list[int]]]:
+    """(sum of differences from the published counts, setting, its counts), closest first."""
+    shared = [v for v in found["pendulum"] if all(v in of for of in found.values())]
+    fits = []
+    for variant in shared:
+        for rule in RULES:
+            for origin in (1, 0):
+                counts = [solves(found[task][variant], rule) for task in TASKS]
+                if None in counts:
+                    continue
+                shown = [count - 1 + origin for count in counts if count is not None]
+                apart = sum(abs(c - k) for c, k in zip(shown, PUBLISHED.values(), strict=True))
+                fits.append((apart, f"{variant}, {rule}, counted from {origin}", shown))
+    return sorted(fits)
+
+
+def _comparisons(task: str, variants: dict[str, dict[str, np.ndarray]]) -> Iterator[Comparison]:
+    name, k = TASKS[task], PUBLISHED[task]
+    ours = solves(variants["as_published"], "max KL < 1e-6")
+    agreeing = [
+        f"{variant} ({rule})" for variant, result in variants.items() for rule in RULES if solves(result, rule) == k
+    ]
+    note = "this count: " + (", ".join(agreeing) if agreeing else "no setting of the scan")
+    yield Comparison(f"{name}, k", k, ours, REPRODUCED if ours == k else NOT_REPRODUCED, note=note)
+    alike = [r for v, r in variants.items() if v == "as_published" or _kind(v) == "sample"]
+    by_power = [variants["tolerance1e-10"]] if "tolerance1e-10" in variants else []
+    counts = [solves(r, "max KL < 1e-6") for r in alike + by_power]
+    low, high = min(c for c in counts if c), max(c for c in counts if c)
+    near = low - VARIES <= BY_SCRIPT[task] <= high + VARIES
+    text = f"{low} to {high}" if low < high else low
+    verdict = IN_DISTRIBUTION if near else NOT_REPRODUCED
+    yield Comparison(f"{name}, solves by the script's rule", BY_SCRIPT[task], text, verdict, ORACLE)
+    if task in THETA:
+        thetas = np.array([r["theta"][-1] for r in alike])
+        near = abs(thetas.mean() - THETA[task]) <= 0.1 * THETA[task]
+        note = f"{len(thetas)} samples of the model, in [{thetas.min():.4g}, {thetas.max():.4g}]"
+        verdict = IN_DISTRIBUTION if near else NOT_REPRODUCED
+        yield Comparison(f"{name}, theta", THETA[task], float(thetas.mean()), verdict, ORACLE, note)
+
+
+def _kind(variant: str) -> str:
+    """What a unit varies: its name without the number."""
+    return re.match(r"[a-z_]+", variant)[0]  # type: ignore[index]
+
+
+def _reading(fits: list[tuple[int, str, list[int]]], found: dict[str, Any]) -> list[str]:
+    apart, name, counts = fits[0]
+    by_accuracy = [
+        f"{variant.removeprefix('tolerance')}: {solves(result, 'max KL < 1e-6')}"
+        for variant, result in found["acrobot"].items() if _kind(variant) == "tolerance"
+    ]  # fmt: skip
+    exact = solves(found["acrobot"]["as_published"], "max KL < 1e-6")
+    reading = [
+        "Counted are eigen-solves, the first (without bias) included; stopped at max KL(optimal dynamics || model) "
+        "< 1e-6 over all (s,a), the rule of the script of May 2022. The rule on chi came with the script of June 2023.",
+        "Eigenvectors are exact in every component, unless a tolerance or a number of power steps is named.",
+    ]
+    if by_accuracy:
+        loose = [
+            f"{variant.removeprefix('tolerance')}: {[solves(found[task][variant], 'max KL < 1e-5') for task in TASKS]}"
+            for variant in ("tolerance3e-2", "tolerance4e-2")
+        ]
+        reading += [
+            "What the count depends on most is how far the power iteration goes: Acrobot takes "
+            f"{exact} solves with exact eigenvectors; stopped when y (maximum 1) changes by less than a tolerance, "
+            f"{', '.join(by_accuracy)}.",
+            "A possible explanation of the published counts, not a known one (two settings of many, and counts vary "
+            f"from sample to sample): eigenvectors stopped at a few per cent, and max KL < 1e-5. {'; '.join(loose)}.",
+        ]
+    closest = f"Closest of {len(fits)} settings of the scan to 28, 38, 29, 58: {name}, with {counts}"
+    reading.append(
+        closest + (": the published counts." if apart == 0 else f", {apart} off in sum; none gives all four.")
+    )
+    return reading
+
+
+def _figure(found: dict[str, dict[str, Any]], scale: str) -> Figure:
+    figure = Figure(figsize=(9.6, 7.4))
+    figure.text(0.06, 0.965, "Table S2: biasing iterations of the control tasks", fontsize=12, weight="bold")
+    about = f"largest KL of the optimal dynamics to the model after each eigen-solve; {samples(scale)} samples of each"
+    about += " (s,a). The script stops below the dotted line"
+    figure.text(0.06, 0.938, about, fontsize=8, color="#555555")
+    for i, (task, variants) in enumerate(found.items()):
+        axes = figure.add_axes((0.075 + 0.49 * (i % 2), 0.565 - 0.475 * (i // 2), 0.41, 0.32))
+        drawn = set()
+        for variant, result in variants.items():
+            if variant == "as_published":
+                continue
+            kind = _kind(variant)
+            colour = COLOURS[1 + list(LABELS).index(kind)]
+            axes.plot(
+                np.arange(1, len(result["kl"]) + 1), np.maximum(result["kl"], 1e-9), color=colour, linewidth=0.8,
+                alpha=0.8, label=None if kind in drawn else LABELS[kind], zorder=2,
+            )  # fmt: skip
+            drawn.add(kind)
+        kl = variants["as_published"]["kl"]
+        axes.plot(np.arange(1, len(kl) + 1), np.maximum(kl, 1e-9), color=COLOURS[0], linewidth=2, label="as described")
+        axes.axhline(1e-6, color="#444444", linestyle=":", linewidth=1)
+        axes.axvline(PUBLISHED[task], color="#444444", linestyle="--", linewidth=1, label="published k")
+        axes.set_yscale("log")
+        axes.set_ylim(1e-9, 20)
+        axes.set_xlim(0, 2.1 * PUBLISHED[task])
+        axes.set_xlabel("eigen-solves", fontsize=8.5)
+        axes.set_ylabel("max KL, nats", fontsize=8.5)
+        axes.tick_params(labelsize=8)
+        ours = solves(variants["as_published"], "max KL < 1e-6")
+        its = control_task(task)
+        title = (
+            f"{TASKS[task]} {its.bins[0]}^{len(its.bins)}, beta {its.beta:g}: k = {ours}, published {PUBLISHED[task]}"
+        )
+        axes.set_title(title, fontsize=9.5)
+        if i == 0:
+            axes.legend(fontsize=7, loc="upper right")
+    return figure
+
+
+ARTIFACT = Artifact("table_s2", "biasing iterations of the discretised control tasks", units, work, assemble)

@@ -1,0 +1,253 @@
+"""A run that is ended at any moment and started again is the run that was not: same bits, one event file."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from conftest import random_mdp
+from test_config import composed
+from test_training import events
+
+from erl_torch import AlgorithmS1, InputError, NonFiniteError, Replicas, Simulation, Solution, Status, collect
+from erl_torch.checkpoint import Checkpoints, decode, digest, encode
+from erl_torch.event_file import EventFile
+from erl_torch.learners import LEARNERS
+from erl_torch.training import train
+
+SMALL = (
+    "experience.n_episodes=3",
+    "evaluation.n_episodes=2",
+    "evaluation.horizon=50",
+    "checkpoint_every=0",
+    "evaluation.pictures=false",
+)
+SHORT = {"s1": ("learner.n_epochs=3", "learner.n_bias=3"), "s1_efficient": ("learner.n_bias=4",)}
+
+
+class Killed(BaseException):
+    """As SIGKILL: nothing of the run's own catches it."""
+
+
+def after(calls, error):
+    """A safe point that ends the run at its n-th call."""
+    count = 0
+
+    def safe_point():
+        nonlocal count
+        count += 1
+        if count == calls:
+            raise error
+
+    return safe_point
+
+
+def scalars(directory):
+    """Every record but the times: tag -> [(step, value)]."""
+    reader = events(directory)
+    tags = [tag for tag in reader.Tags()["scalars"] if not tag.startswith("time/")]
+    return {tag: [(e.step, e.value) for e in reader.Scalars(tag)] for tag in tags}
+
+
+def names(directory):
+    return sorted(p.name if "tfevents" not in p.name else "events" for p in directory.iterdir())
+
+
+def ended(cfg, directory, epochs, error=Killed):
+    """A run that is ended after so many epochs more."""
+    before = 0 if cfg.n_replicas > 1 else 2  # safe points while the experience is collected
+    with pytest.raises(error):
+        train(cfg, directory, after(before + epochs, error()))
+
+
+@pytest.mark.parametrize("learner", [name for name in LEARNERS if name != "exact"])
+@pytest.mark.parametrize("error", [Killed, SystemExit])
+def test_bits_of_an_ended_run_are_those_of_a_whole_one(tmp_path, learner, error):
+    cfg = composed(f"learner={learner}", *SMALL, *SHORT.get(learner, ()))
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    train(cfg, whole)
+    ended(cfg, cut, 1, error)
+    assert (cut / "checkpoints").exists()
+    if learner != "certainty_equivalence":  # which has one epoch
+        ended(cfg, cut, 2, error)
+    result = train(cfg, cut)
+    assert result["status"] in ("completed", "converged")
+    assert names(cut) == names(whole) == ["events", "result.json", "settings.json", "solution.npz"]
+    assert (cut / "solution.npz").read_bytes() == (whole / "solution.npz").read_bytes()
+    assert scalars(cut) == scalars(whole)
+
+
+@pytest.mark.parametrize("learner", ["s1", "s1_efficient", "q_learning"])
+def test_replicas_go_on_too(tmp_path, learner):
+    arguments = ("n_replicas=2", "++vary.beta=[3,10]", f"learner={learner}", *SMALL, *SHORT.get(learner, ()))
+    cfg = composed(*arguments)
+    train(cfg, tmp_path / "whole")
+    ended(cfg, tmp_path / "cut", 1)
+    ended(cfg, tmp_path / "cut", 2, SystemExit)
+    train(cfg, tmp_path / "cut")
+    assert names(tmp_path / "cut") == names(tmp_path / "whole")
+    assert (tmp_path / "cut/replicas.npz").read_bytes() == (tmp_path / "whole/replicas.npz").read_bytes()
+    assert scalars(tmp_path / "cut") == scalars(tmp_path / "whole")
+
+
+def test_exact_solution_begins_anew(tmp_path):
+    cfg = composed("learner=exact", *SMALL[1:])
+    train(cfg, tmp_path / "whole")
+    with pytest.raises(Killed):
+        train(cfg, tmp_path / "cut", after(2, Killed()))
+    train(cfg, tmp_path / "cut")
+    assert scalars(tmp_path / "cut") == scalars(tmp_path / "whole")
+
+
+@pytest.fixture
+def cut(tmp_path):
+    """(configuration, directory of a run ended after its fourth epoch, the newest checkpoint last)."""
+    cfg = composed(*SMALL, *SHORT["s1"])
+    ended(cfg, tmp_path / "run", 4)
+    return cfg, tmp_path / "run", sorted((tmp_path / "run/checkpoints").iterdir())
+
+
+def test_the_last_two_are_kept(cut):
+    assert [path.name for path in cut[2]] == [f"{step:018d}.ckpt" for step in (9000, 12000)]
+
+
+@pytest.mark.parametrize("damage", ["cut", "flipped", "empty", "other"])
+def test_a_damaged_checkpoint_is_passed_over(tmp_path, cut, capsys, damage):
+    cfg, directory, paths = cut
+    body = bytearray(paths[-1].read_bytes())
+    body[len(body) // 2] ^= 1
+    spoilt = {"cut": body[: len(body) // 2], "flipped": body, "empty": b"", "other": b"hello\nworld"}[damage]
+    paths[-1].write_bytes(spoilt)
+    (directory / "checkpoints/.x.ckpt.99.tmp").write_bytes(b"half")
+    train(cfg, directory)
+    said = capsys.readouterr().err
+    assert f"warning: {paths[-1]} cannot be read" in said
+    train(cfg, tmp_path / "whole")
+    assert (directory / "solution.npz").read_bytes() == (tmp_path / "whole/solution.npz").read_bytes()
+    assert scalars(directory) == scalars(tmp_path / "whole")
+
+
+def test_without_a_good_checkpoint_the_run_begins_anew(tmp_path, cut):
+    cfg, directory, paths = cut
+    for path in paths:
+        path.write_bytes(b"")
+    train(cfg, directory)
+    train(cfg, tmp_path / "whole")
+    assert scalars(directory) == scalars(tmp_path / "whole")
+    assert names(directory) == names(tmp_path / "whole")
+
+
+def test_other_settings_are_refused_by_name(cut):
+    _, directory, _ = cut
+    before = {path: path.read_bytes() for path in directory.rglob("*") if path.is_file()}
+    other = composed(*SMALL, *SHORT["s1"], "learner.beta=5", "env.trap_reward=-4", "checkpoint_every=7", "threads=2")
+    with pytest.raises(InputError) as error:
+        train(other, directory)
+    said = str(error.value)
+    assert said.startswith(f"hydra.run.dir={directory}: must be of a run with these settings, or a new one: not ")
+    assert "env.trap_reward=-4.0 (there: -5.0)" in said
+    assert "learner.beta=5.0 (there: 10.0)" in said
+    assert "threads" not in said  # results do not depend on it
+    assert {path: path.read_bytes() for path in directory.rglob("*") if path.is_file()} == before
+
+
+def test_another_stream_is_refused(tmp_path):
+    mdp = random_mdp(np.random.default_rng(0), 4, 2)
+    mdp.save(tmp_path / "mdp.npz")
+    collect(mdp, 1, 1000, 0).save(tmp_path / "t.npz")
+    arguments = ("env=mdp", f"env.path={tmp_path}/mdp.npz", "experience=recorded", f"experience.path={tmp_path}/t.npz")
+    cfg = composed(*arguments, *SMALL[1:], *SHORT["s1"])
+    with pytest.raises(Killed):
+        train(cfg, tmp_path / "run", after(3, Killed()))
+    collect(mdp, 1, 1000, 1).save(tmp_path / "t.npz")
+    with pytest.raises(InputError, match="experience=another stream: must be the one that the run"):
+        train(cfg, tmp_path / "run")
+
+
+def test_a_complete_run_is_not_repeated(tmp_path, capsys):
+    cfg = composed(*SMALL, *SHORT["s1"])
+    first = train(cfg, tmp_path)
+    files = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    assert train(cfg, tmp_path) == first
+    assert "is complete" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == files
+
+
+def test_interval(tmp_path, monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr("erl_torch.checkpoint.time.monotonic", lambda: now[0])
+    saved = Checkpoints(tmp_path, {}, 10.0)
+    for step, at in enumerate((9.9, 10.0, 15.0, 20.1)):
+        now[0] = at
+        saved.offer(step, lambda: {})
+    assert sorted(p.name for p in (tmp_path / "checkpoints").iterdir()) == [f"{i:018d}.ckpt" for i in (1, 3)]
+    never = Checkpoints(tmp_path / "never", {}, None)
+    now[0] = 1e9
+    never.offer(1, lambda: {})
+    assert not (tmp_path / "never").exists()
+    never.offer(1, lambda: {}, now=True)
+    assert len(list((tmp_path / "never/checkpoints").iterdir())) == 1
+
+
+def test_values_come_back_as_they_were():
+    learner = AlgorithmS1(beta=10.0, lr_u=0.5, lr_rho=1e-3, n_epochs=2, n_bias=1)
+    mdp = random_mdp(np.random.default_rng(0), 3, 2)
+    *_, state = Replicas.of(learner, 2).iterate(Simulation(mdp, 1, 100, range(2)), 3, 2)
+    error = NonFiniteError(3, "why")
+    solution = learner.fit(collect(mdp, 1, 100, 0), 3, 2)
+    there = {"a": [1, 2.5, None, True, "x"], "b": (state, error, solution), 3: np.arange(3.0), "c": 2**100}
+    back = decode(encode(there))
+    assert back["a"] == there["a"]
+    assert back["c"] == 2**100
+    assert np.array_equal(back[3], there[3])
+    again, failure, answer = back["b"]
+    assert (failure.step, failure.cause) == (3, "why")
+    assert np.array_equal(again.u, state.u)
+    assert torch.equal(again.policy, state.policy)
+    assert isinstance(answer, Solution)
+    assert answer.status is Status.COMPLETED
+    with pytest.raises(ValueError, match="unknown class Path"):
+        decode({"class": "Path"})
+
+
+def test_digest_sees_every_column():
+    data = collect(random_mdp(np.random.default_rng(0), 4, 3), 1, 50, 0)
+    found = {digest(data)}
+    for name in ("s", "a", "r", "s_next", "a_next"):
+        column = getattr(data, name).copy()
+        column[-1] += 1
+        found.add(digest(type(data)(**{**vars(data), name: column})))
+    assert len(found) == 6
+
+
+def test_event_file_is_cut_and_gone_on_with(tmp_path):
+    from torch.utils.tensorboard import summary
+
+    file = EventFile(tmp_path)
+    file.add(summary.scalar("x", 1.0), 1)
+    size = file.flush()
+    file.add(summary.scalar("x", 2.0), 2)
+    file.close()
+    (path,) = tmp_path.iterdir()
+    path.write_bytes(path.read_bytes()[:-3])  # killed in the midst of a record
+    file = EventFile(tmp_path, size)
+    file.add(summary.scalar("x", 3.0), 2)
+    file.close()
+    assert [(e.step, e.value) for e in events(tmp_path).Scalars("x")] == [(1, 1.0), (2, 3.0)]
+    assert len(list(tmp_path.iterdir())) == 1
+    EventFile(tmp_path, 10**9).close()  # shorter than it was: it cannot be gone on with
+    assert events(tmp_path).Tags()["scalars"] == []
+
+
+@pytest.mark.parametrize("value", ["-1", "nan"])
+def test_bad_interval_is_named(tmp_path, value):
+    with pytest.raises(InputError, match=r"checkpoint_every=.*must be seconds >= 0, or null"):
+        train(composed(f"checkpoint_every={value}"), tmp_path)
+
+
+def test_damaged_settings_are_named(tmp_path):
+    (tmp_path / "settings.json").write_text("{")
+    with pytest.raises(InputError, match=r"settings=.*settings\.json: must be readable JSON"):
+        train(composed(*SMALL), tmp_path)
+    assert json.dumps(sorted(p.name for p in Path(tmp_path).iterdir())) == '["settings.json"]'
