@@ -28,7 +28,7 @@ from erl_torch.mdp import check_policy
 from erl_torch.solvers.problem import Problem
 from erl_torch.transitions import Recording
 
-BLOCK = 1 << 22  # tuples a compiled call, so that signals are served several times a second
+BLOCK = 1 << 16  # tuples at a time: they stay in the processor's cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,19 +160,22 @@ def tally(data: Recording, n_states: int, n_actions: int, lr_psi: float = 0.0) -
     table, shift = _table(keys, 0, 2 * size)
     varied, smallest, largest = False, np.inf, -np.inf
     for chunk in data.chunks():
-        pair = chunk.s * np.int32(n_actions) + chunk.a
-        done = 0
-        while done < len(chunk):
-            if used == size:
-                size *= 2
-                keys, older, counts, totals, weight = (_longer(x, size) for x in (keys, older, counts, totals, weight))
-                table, shift = _table(keys, used, 2 * size)
-            part = slice(min(len(chunk), done + BLOCK))
-            done, used, changed, low, high = kernels.tally(
-                pair[part], chunk.s_next[part], chunk.r[part], n_states, lr_psi, shift, table, keys, older, newest,
-                counts, totals, weight, visits, reward, scale, used, done,
-            )  # fmt: skip
-            varied, smallest, largest = varied or changed, min(smallest, low), max(largest, high)
+        for begin in range(0, len(chunk), BLOCK):
+            block = slice(begin, begin + BLOCK)
+            pair, s_next, r = chunk.s[block] * np.int32(n_actions) + chunk.a[block], chunk.s_next[block], chunk.r[block]
+            done = 0
+            while done < len(pair):
+                if used == size:
+                    size *= 2
+                    keys, older, counts, totals, weight = (
+                        _longer(x, size) for x in (keys, older, counts, totals, weight)
+                    )
+                    table, shift = _table(keys, used, 2 * size)
+                done, used, changed, low, high = kernels.tally(
+                    pair, s_next, r, n_states, lr_psi, shift, table, keys, older, newest, counts, totals, weight,
+                    visits, reward, scale, used, done,
+                )  # fmt: skip
+                varied, smallest, largest = varied or changed, min(smallest, low), max(largest, high)
     order = np.argsort(keys[:used])
     row, indices = np.divmod(keys[:used][order], n_states)
     return Tally(

@@ -43,7 +43,8 @@ from erl_torch.mdp import check_policy
 from erl_torch.rng import streams
 from erl_torch.transitions import COLUMNS, Checksum, Recording, Transitions, join, regroup
 
-CHUNK = 1 << 22  # tuples: 100 MB of columns
+CHUNK = 1 << 22  # tuples held in memory: 100 MB of columns
+READ = 1 << 16  # tuples at a time, of longer ones: they stay in the processor's cache
 TYPES = {name: np.dtype("<f8" if name == "r" else "<i4") for name in COLUMNS}
 
 Batch = dict[str, np.ndarray]
@@ -66,7 +67,7 @@ class FileRecording:
         path: see the module's docstring.
         n_states, n_actions: sizes of the problem.
         on_bad: "stop" or "skip", for bad tuples.
-        chunk: tuples at a time, at least 1 (and at least what a learner handles at once, some thousands).
+        chunk: tuples at a time at most (but for what a learner handles at once, some thousands); ``held`` holds as many.
         env, prior_policy, on_prior, seed: for Minari: the environment whose bins serve where the spaces are Box, and
             where a' comes from.
         report: called with the number of tuples read so far.
@@ -112,7 +113,7 @@ class FileRecording:
         self.first_skipped = ""
         self._counted = False
         running = Checksum()
-        for part in self._read(chunk):
+        for part in self._read(min(chunk, READ)):
             self._n += len(part)
             self._checksum = running.of(part)
             if report is not None:
@@ -137,7 +138,7 @@ class FileRecording:
     def chunks(self, multiple: int = 1) -> Iterator[Transitions]:
         """One pass; see ``Recording``. Raises InputError for a file that is no longer what it was."""
         n = 0
-        for part in regroup(self._read(max(1, self._chunk // multiple) * multiple), multiple):
+        for part in regroup(self._read(max(1, min(self._chunk, READ) // multiple) * multiple), multiple):
             n += len(part)
             yield part
         if n != self._n:
