@@ -67,7 +67,7 @@ class FileRecording:
         path: see the module's docstring.
         n_states, n_actions: sizes of the problem.
         on_bad: "stop" or "skip", for bad tuples.
-        chunk: tuples at a time at most (but for what a learner handles at once, some thousands); ``held`` holds as many.
+        chunk: tuples at a time at most (but for what a learner handles at once, some thousands), in ``held`` too.
         env, prior_policy, on_prior, seed: for Minari: the environment whose bins serve where the spaces are Box, and
             where a' comes from.
         report: called with the number of tuples read so far.

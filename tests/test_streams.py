@@ -7,6 +7,7 @@ import re
 import warnings
 from dataclasses import fields
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
@@ -293,6 +294,18 @@ def test_recording_moves_the_generators_as_collecting_does(tmp_path):
     assert open_recording(tmp_path / "t", 5, 3).checksum() == collect(MDP, 4, 250, 3, behaviour).checksum()
 
 
+@pytest.mark.parametrize("vector", [False, True])
+def test_environments_are_recorded_piece_by_piece(tmp_path, vector):
+    made = [gym.make_vec("FrozenLake-v1", 3) if vector else gym.make("FrozenLake-v1") for _ in range(2)]
+    reported = []
+    record(made[0], tmp_path / "t", 220 if vector else 1600, 50, 0, report=reported.append)
+    data = collect(made[1], 220 if vector else 1600, 50, 0)
+    assert len(data) > 10_000
+    assert len(reported) > 1
+    assert reported[-1] == len(data)
+    assert open_recording(tmp_path / "t", 16, 4).checksum() == data.checksum()
+
+
 def damaged(rng, folder, kind):
     """A file in which something is wrong."""
     data = NOISY.first(200)
@@ -398,7 +411,6 @@ EPISODES = [
 
 
 def test_minari_episodes_become_tuples(tmp_path, monkeypatch):
-    import gymnasium as gym
     import minari
     from minari.data_collector import EpisodeBuffer
 
