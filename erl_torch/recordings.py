@@ -174,7 +174,8 @@ class FileRecording:
         kinds, allowed = ("iuf", "numbers") if name == "r" else ("iu", "whole numbers")
         if column.dtype.kind not in kinds:
             raise InputError(f"path={self.path}: {name}", f"dtype {column.dtype}", f"a column of {allowed}")
-        return column
+        with np.errstate(over="ignore"):  # of wider numbers: they are no longer finite
+            return np.asarray(column, np.float64) if name == "r" else column
 
     def _bad(self, columns: Batch, first: int) -> np.ndarray | None:
         """Mask of the bad tuples, None without any. Raises InputError for the first where that is an error."""
