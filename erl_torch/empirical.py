@@ -152,11 +152,9 @@ def tally(data: Recording, n_states: int, n_actions: int, lr_psi: float = 0.0) -
     n_pairs = n_states * n_actions
     if n_pairs > np.iinfo(np.int32).max:
         raise InputError("n_states * n_actions", n_pairs, "below 2**31")
-    pairs = np.zeros(n_pairs, np.int64), np.zeros(n_pairs), np.ones(n_pairs), np.full(n_pairs, -1, np.int64)
-    visits, reward, scale, newest = pairs
+    pairs = np.tile([0.0, 0.0, 1.0, -1.0], (n_pairs, 1))
     size, used = 512, 0
-    keys, older, counts = (np.empty(size, np.int64), np.empty(size, np.int64), np.zeros(size, np.int64))
-    totals, weight = np.zeros(size), np.zeros(size)
+    keys, entries = np.empty(size, np.int64), np.zeros((size, 4))
     table, shift = _table(keys, 0, 2 * size)
     varied, smallest, largest = False, np.inf, -np.inf
     for chunk in data.chunks():
@@ -166,40 +164,32 @@ def tally(data: Recording, n_states: int, n_actions: int, lr_psi: float = 0.0) -
             done = 0
             while done < len(pair):
                 if used == size:
-                    size *= 2
-                    keys, older, counts, totals, weight = (
-                        _longer(x, size) for x in (keys, older, counts, totals, weight)
-                    )
+                    size *= 4
+                    keys, entries = np.resize(keys, size), np.concatenate((entries, np.zeros((size - used, 4))))
                     table, shift = _table(keys, used, 2 * size)
                 done, used, changed, low, high = kernels.tally(
-                    pair, s_next, r, n_states, lr_psi, shift, table, keys, older, newest, counts, totals, weight,
-                    visits, reward, scale, used, done,
-                )  # fmt: skip
+                    pair, s_next, r, n_states, lr_psi, shift, table, keys, entries, pairs, used, done
+                )
                 varied, smallest, largest = varied or changed, min(smallest, low), max(largest, high)
     order = np.argsort(keys[:used])
     row, indices = np.divmod(keys[:used][order], n_states)
+    counts, totals, weight, _ = entries[order].T
     return Tally(
-        visits=visits,
+        visits=pairs[:, 0].astype(np.int64),
         indptr=np.concatenate(([0], np.cumsum(np.bincount(row, minlength=n_pairs)))),
         indices=indices.astype(np.int32),
-        counts=counts[order],
-        reward_given_next=totals[order] / counts[order],
-        last_reward=reward,
+        counts=counts.astype(np.int64),
+        reward_given_next=totals / counts,
+        last_reward=pairs[:, 1].copy(),
         varied=varied,
         reward_range=(float(smallest), float(largest)),
-        psi_weight=weight[order] * scale[row],
+        psi_weight=weight * pairs[row, 2],
     )
 
 
-def _longer(column: np.ndarray, size: int) -> np.ndarray:
-    longer = np.zeros(size, column.dtype)
-    longer[: len(column)] = column
-    return longer
-
-
 def _table(keys: np.ndarray, used: int, size: int) -> tuple[np.ndarray, int]:
-    """(hash table [size] of the entries, shift), for ``kernels.tally``; size a power of two."""
-    table = np.full(size, -1, np.int64)
+    """(hash table [size, 2] of the entries, shift), for ``kernels.tally``; size a power of two."""
+    table = np.full((size, 2), -1, np.int64)
     shift = 65 - size.bit_length()
     kernels.enter(table, keys, used, shift)
     return table, shift

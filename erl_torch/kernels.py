@@ -29,33 +29,34 @@ def compiled_before() -> bool:
 
 
 @numba.njit(cache=True, error_model="numpy", nogil=True)
-def _slot(table, keys, key, shift):
-    """Where ``key`` stands in the table of entries, or is to stand: an entry of -1."""
-    last = table.size - 1
+def _slot(table, key, shift):
+    """Row of the table that holds ``key``, or the free one (entry -1) that is to hold it."""
+    last = len(table) - 1
     slot = np.int64((np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(shift))
-    while table[slot] >= 0 and keys[table[slot]] != key:
+    while table[slot, 1] >= 0 and table[slot, 0] != key:
         slot = (slot + 1) & last
     return slot
 
 
 @numba.njit(cache=True, error_model="numpy", nogil=True)
 def enter(table, keys, used, shift):
-    """Fill an empty table with the first ``used`` entries."""
+    """Fill a free table with the first ``used`` entries."""
     for e in range(used):
-        table[_slot(table, keys, keys[e], shift)] = e
+        slot = _slot(table, keys[e], shift)
+        table[slot, 0] = keys[e]
+        table[slot, 1] = e
 
 
 @numba.njit(cache=True, error_model="numpy", nogil=True)
-def tally(
-    pair, s_next, r, n_states, lr_psi, shift, table, keys, older, newest, counts, totals, weight, visits, reward, scale,
-    used, begin,
-):  # fmt: skip
-    """Tuples from ``begin`` on: visits and last reward of every pair; of every (pair, s') met, an entry each, the
-    tuples, the sum of rewards and, with ``lr_psi`` > 0, its weight in W of one psi epoch.
+def tally(pair, s_next, r, n_states, lr_psi, shift, table, keys, entries, pairs, used, begin):
+    """Tuples from ``begin`` on, counted into rows, so that a tuple touches few cache lines:
 
-    The i-th visit from the end of a pair enters W with weight lr_psi * (1 - lr_psi)**i; scale [n_pairs] * weight is W.
-    ``table`` [2**(64 - shift)] finds entries by their key, pair * n_states + s'; ``older`` and ``newest`` [n_pairs]
-    link the entries of a pair. Everything changes in place.
+        pairs [n_pairs, 4]   visits, last reward, factor of the weights below, newest entry of the pair
+        entries [n, 4]       of a (pair, s') met: tuples, sum of rewards, weight, next older entry of the pair
+
+    With ``lr_psi`` > 0, factor * weight is W of one psi epoch: the i-th visit of a pair from its end enters with
+    lr_psi * (1 - lr_psi)**i. ``table`` [2**(64 - shift), 2] holds key = pair * n_states + s' and entry; ``keys`` [n]
+    the keys by entry. All change in place.
 
     Returns (t, used, varied, smallest r, largest r): t < N where the entries, all ``used``, do not suffice; varied
     where a reward is not the one of the pair's visit before.
@@ -66,37 +67,38 @@ def tally(
     for t in range(begin, pair.size):
         k = np.int64(pair[t])
         key = k * n_states + s_next[t]
-        slot = _slot(table, keys, key, shift)
-        e = table[slot]
+        slot = _slot(table, key, shift)
+        e = table[slot, 1]
         if e < 0:
             if used == keys.size:
                 return t, used, varied, smallest, largest
             e = used
             used += 1
-            table[slot] = e
+            table[slot, 0] = key
+            table[slot, 1] = e
             keys[e] = key
-            older[e] = newest[k]
-            newest[k] = e
-        counts[e] += 1
-        totals[e] += r[t]
-        if visits[k] > 0 and reward[k] != r[t]:
+            entries[e, 3] = pairs[k, 3]
+            pairs[k, 3] = e
+        entries[e, 0] += 1.0
+        entries[e, 1] += r[t]
+        if pairs[k, 0] > 0.0 and pairs[k, 1] != r[t]:
             varied = True
-        visits[k] += 1
-        reward[k] = r[t]
+        pairs[k, 0] += 1.0
+        pairs[k, 1] = r[t]
         smallest = min(smallest, r[t])
         largest = max(largest, r[t])
         if lr_psi > 0.0:
             # A visit multiplies the pair's whole row; the weights change only once the factor leaves the range where
             # nothing is lost.
-            factor = scale[k] * (1.0 - lr_psi)
+            factor = pairs[k, 2] * (1.0 - lr_psi)
             if factor < 1e-200:
-                m = newest[k]
+                m = np.int64(pairs[k, 3])
                 while m >= 0:
-                    weight[m] *= factor
-                    m = older[m]
+                    entries[m, 2] *= factor
+                    m = np.int64(entries[m, 3])
                 factor = 1.0
-            scale[k] = factor
-            weight[e] += lr_psi / factor
+            pairs[k, 2] = factor
+            entries[e, 2] += lr_psi / factor
     return pair.size, used, varied, smallest, largest
 
 
