@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import math
 import shutil
 import sys
 import time
@@ -184,6 +185,7 @@ def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     for key, value in settings.items():
         if isinstance(value, Mapping) and value:
             found |= _flat(value, f"{prefix}{key}.")
-        else:
-            found[f"{prefix}{key}"] = value
+        else:  # JSON has no infinities
+            finite = not isinstance(value, float) or math.isfinite(value)
+            found[f"{prefix}{key}"] = value if finite else str(value)
     return found

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
+SMALLEST_BETA, LARGEST_BETA = 1e-100, 1e100  # products with rewards stay in double precision
+
 
 class InputError(ValueError):
     """A value that was handed in is unusable. ``str`` is one line: key, value, what is allowed.
@@ -28,6 +30,13 @@ def positive(key: str, value: float) -> None:
     """Raise InputError unless ``value`` is a finite number > 0."""
     if not (is_number(value) and math.isfinite(value) and value > 0):
         raise InputError(key, value, "a finite number > 0")
+
+
+def temperature(key: str, value: float) -> None:
+    """Raise InputError unless ``value`` is an inverse temperature that leaves products in double precision."""
+    positive(key, value)
+    if not SMALLEST_BETA <= value <= LARGEST_BETA:
+        raise InputError(key, value, f"in [{SMALLEST_BETA:g}, {LARGEST_BETA:g}]")
 
 
 def step_size(key: str, value: float) -> None:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import math
 import os
 import re
 import shutil
 import signal
 import sys
 import threading
+import traceback
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -22,11 +24,16 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from erl_torch import sweeps
 from erl_torch.checks import InputError
+from erl_torch.config import register
+from erl_torch.files import alone
+
+# Here, for jobs in processes of their own: loading the task imports this module, and names directories next.
+register()
 
 BY_RUN = (InputError, ArithmeticError, OSError)
 BY_CONFIGURATION = (HydraException, OmegaConfBaseException)
-REPORTED = "reported by its job"
 OPEN_NODES = (
     "env.kwargs.",
     "env.kwargs=",
@@ -40,7 +47,10 @@ OPEN_NODES = (
 class Signals:
     """SIGINT and SIGTERM wait for a safe point: an exception out of a signal handler that happens to run
     inside the compiler or a compiled loop is lost there, or crashes the process. A second signal is not
-    held back."""
+    held back.
+
+    So does a user's signal that has a handler: submitit's, which queues the job again before its time is up.
+    The handler is called at the end."""
 
     def __init__(self) -> None:
         self.received: int | None = None
@@ -48,12 +58,16 @@ class Signals:
 
     def __enter__(self) -> Signals:
         if threading.current_thread() is threading.main_thread():
-            self._before = {n: signal.signal(n, self._note) for n in (signal.SIGINT, signal.SIGTERM)}
+            numbers = [signal.SIGINT, signal.SIGTERM]
+            numbers += [n for n in (signal.SIGUSR1, signal.SIGUSR2) if callable(signal.getsignal(n))]
+            self._before = {n: signal.signal(n, self._note) for n in numbers}
         return self
 
-    def __exit__(self, *error: Any) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *error: Any) -> None:
         for number, handler in self._before.items():
             signal.signal(number, handler)
+        if kind is SystemExit and self.received in (signal.SIGUSR1, signal.SIGUSR2):
+            self._before[self.received](self.received, None)
 
     def safe_point(self) -> None:
         """Raise SystemExit(128 + signal) if one has come."""
@@ -62,7 +76,8 @@ class Signals:
 
     def _note(self, number: int, frame: Any) -> None:
         self.received = number
-        signal.signal(number, signal.SIG_DFL)
+        if number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_DFL)
         print("\nstopping at the next safe point; what is done will be saved", file=sys.stderr)
 
 
@@ -70,31 +85,60 @@ def job(work: Callable[[DictConfig, Path, Callable[[], None]], Any]) -> Callable
     """A Hydra task out of ``work(cfg, run_directory, safe_point)``.
 
     ``safe_point`` is to be called where the work may be ended: it raises SystemExit after a signal.
-    Bad input ends a single run with one line and exit code 1, and fails that job alone in a multirun;
-    a run directory in which nothing was written goes again.
+    Bad input ends a single run with one line and exit code 1; a run directory in which nothing was written goes
+    again, and one that another process writes to is bad input. A job of a multirun that fails says so in a note
+    (``erl_torch.sweeps``) and returns None: a failed trial for a sweeper, and no matter for the other jobs.
     """
 
     @functools.wraps(work)
     def task(cfg: DictConfig) -> Any:
         hydra = HydraConfig.get()
         directory = Path(hydra.runtime.output_dir)
+        # A directory without a configuration is many runs'.
+        attempt = functools.partial(_attempt, work, cfg, directory, shared=hydra.output_subdir is None)
+        if hydra.mode == RunMode.MULTIRUN:
+            return _one_of_many(attempt, hydra, directory)
+        try:
+            return attempt()
+        except BY_RUN as error:
+            raise SystemExit(_report(error)) from error
+
+    return task
+
+
+def _attempt(work: Callable[..., Any], cfg: DictConfig, directory: Path, shared: bool) -> Any:
+    with contextlib.nullcontext() if shared else alone(directory):
         try:
             with Signals() as signals:
                 return work(cfg, directory, signals.safe_point)
-        except Exception as error:
-            if not isinstance(error, BY_RUN):
-                raise
+        except BY_RUN:
             if {entry.name for entry in directory.iterdir()} <= {".hydra"}:
                 shutil.rmtree(directory)
                 with contextlib.suppress(OSError):  # not empty: other runs
                     directory.parent.rmdir()
-            if hydra.mode != RunMode.MULTIRUN:
-                raise SystemExit(_report(error)) from error
-            print(f"error: job {hydra.job.num} ({hydra.job.override_dirname}): {_line(error)}", file=sys.stderr)
-            error.add_note(REPORTED)
             raise
 
-    return task
+
+def _one_of_many(attempt: Callable[[], Any], hydra: Any, directory: Path) -> Any:
+    sweep, number, launcher = Path(hydra.sweep.dir), hydra.job.num, str(hydra.launcher._target_)
+    sweeps.note(sweep, number, "running", directory=os.path.relpath(directory, sweep), complaint=None)
+    try:
+        value = attempt()
+    except SystemExit:
+        if "submitit" in launcher:
+            raise  # queued again or cancelled: whoever waits for the job sees which
+        sweeps.fail(sweep, number, "stopped by a signal")
+        if "joblib" not in launcher:
+            raise  # the signal was meant for the whole sweep
+        return None
+    except Exception as error:
+        if not isinstance(error, BY_RUN):
+            traceback.print_exc()
+        complaint = _line(error) if isinstance(error, BY_RUN) else f"{type(error).__name__}: {error}"
+        sweeps.fail(sweep, number, complaint)
+        return None
+    sweeps.note(sweep, number, "ended", value=value if isinstance(value, float) and math.isfinite(value) else None)
+    return value
 
 
 def run(main: Callable[[], Any], about: str, conf: Path, config_name: str) -> None:
@@ -119,18 +163,27 @@ def run(main: Callable[[], Any], about: str, conf: Path, config_name: str) -> No
     full = bool(os.environ.get("HYDRA_FULL_ERROR"))
     # Hydra then raises what it would otherwise print over several lines.
     os.environ["HYDRA_FULL_ERROR"] = "1"
+    rows: list[dict[str, Any]] = []
     try:
+        sweeps.presets()
         if {"-h", "--help"} & set(arguments):
             print(_help(about, conf, config_name, [a for a in arguments if not a.startswith("-")]))
             return
-        main()
+        with sweeps.patient_launchers() as directories:
+            try:
+                main()
+            finally:
+                rows = [row for directory in directories for row in sweeps.show(directory)]
     except KeyboardInterrupt:
         raise SystemExit(130) from None
     except Exception as error:
+        if rows and len(sweeps.failures(rows)) == len(rows):
+            raise SystemExit(1) from None  # a sweeper has nothing to choose from, and says so in its own way
         if full or not isinstance(error, BY_CONFIGURATION + BY_RUN):
             raise
-        said = REPORTED in getattr(error, "__notes__", ())
-        raise SystemExit(1 if said else _report(error)) from None
+        raise SystemExit(_report(error)) from None
+    if sweeps.failures(rows):
+        raise SystemExit(1)
 
 
 def _resumed(arguments: list[str]) -> list[str]:
@@ -199,6 +252,9 @@ def _explain(error: Exception) -> str:
     choice = re.search(r"Could not find '(\S+)/([^'/]+)'\s+Available options in '[^']*':\n((?:\t\S+\n?)+)", said)
     if choice:
         group, name, options = choice.groups()
+        if group.startswith("hydra/") and name in sweeps.EXTRAS:
+            extra = sweeps.EXTRAS[name]
+            return f"{group}={name}: not installed; pip install -c constraints.txt -e '.[{extra}]'"
         return str(InputError(group, name, " or ".join(options.split())))
     missing = re.search(r"Missing mandatory value: (\S+)", said)
     if missing:

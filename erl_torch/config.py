@@ -310,6 +310,17 @@ class Reproduce:
     processes: int = 2
 
 
+@dataclass
+class Play:
+    run: str = MISSING
+    n_episodes: int = 20
+    seed: int = 0
+    greedy: bool = False
+    replica: int | None = None
+    render: str = "ansi"
+    n_steps: int | None = None
+
+
 SCHEMAS: dict[str, dict[str, type]] = {
     "env": {
         "windy_cliff": WindyCliff,
@@ -363,13 +374,14 @@ def register() -> None:
     store.store(group="schema", name="train", node=Train)
     store.store(group="schema", name="compare", node=Compare)
     store.store(group="schema", name="reproduce", node=Reproduce)
+    store.store(group="schema", name="play", node=Play)
     OmegaConf.register_new_resolver("slug", slug, replace=True)
     OmegaConf.register_new_resolver("run_name", run_name, replace=True)
 
 
-def check_keys(cfg: DictConfig) -> None:
+def check_keys(cfg: DictConfig, schema: type = Train) -> None:
     """Raise InputError for a key that no schema has, and for one that has no value."""
-    _check_node(cfg, Train, "")
+    _check_node(cfg, schema, "")
 
 
 def check_comparison_keys(cfg: DictConfig) -> None:

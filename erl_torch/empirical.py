@@ -55,7 +55,7 @@ class EmpiricalMDP:
         Raises:
             InputError: beta or prior out of range, or no state that is ever returned to.
         """
-        checks.positive("beta", beta)
+        checks.temperature("beta", beta)
         prior = check_policy("prior_policy", prior_policy, self.n_states, self.n_actions)
         if not (prior > 0).all():
             s, a = np.argwhere(prior <= 0)[0]
@@ -147,7 +147,16 @@ class Tally:
 
 
 def tally(data: Recording, n_states: int, n_actions: int, lr_psi: float = 0.0) -> Tally:
-    """Count a stream, however it is cut to the same bits. Raises InputError naming the first tuple out of range."""
+    """Count a stream: to the same bits, however it is cut.
+
+    Args:
+        data: the tuples; a' is not used.
+        n_states, n_actions: sizes of the tables.
+        lr_psi: step size of lines 2-3 of Algorithm S1, for W; 0: there is none.
+
+    Raises:
+        InputError: naming the first tuple with a state or action out of range.
+    """
     data.check_range(n_states, n_actions)
     n_pairs = n_states * n_actions
     if n_pairs > np.iinfo(np.int32).max:
@@ -196,9 +205,15 @@ def _table(keys: np.ndarray, used: int, size: int) -> tuple[np.ndarray, int]:
 
 
 def empirical_mdp(data: Recording, n_states: int, n_actions: int, found: Tally | None = None) -> EmpiricalMDP:
-    """Counts and mean rewards of a stream (``found``: its tally, where there is one).
+    """Counts and mean rewards of a stream: one pass over it, and two more where rewards vary.
 
-    One pass, and two more where rewards vary. Raises InputError naming the first tuple out of range.
+    Args:
+        data: the tuples; a' is not used.
+        n_states, n_actions: sizes of the tables.
+        found: the tally of the stream, where there is one already.
+
+    Raises:
+        InputError: naming the first tuple with a state or action out of range.
     """
     found = found or tally(data, n_states, n_actions)
     visits, base = found.visits, found.last_reward

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import json
 import os
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -63,6 +65,38 @@ def write_png(path: str | os.PathLike[str], pixels: np.ndarray) -> Path:
     from matplotlib.image import imsave
 
     return _write(path, lambda file: imsave(file, pixels, format="png", metadata={"Software": ""}))
+
+
+@contextlib.contextmanager
+def alone(directory: str | os.PathLike[str]) -> Iterator[None]:
+    """Hold a run directory: a lock that ends with the process, however that ends, and leaves no file.
+
+    Raises InputError if another process holds it. File systems without locks let everybody in.
+    """
+    descriptor = os.open(directory, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise InputError("hydra.run.dir", directory, "a directory that no other run is writing to") from error
+        except OSError:
+            pass
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def write_gif(path: str | os.PathLike[str], frames: Sequence[np.ndarray], fps: float) -> Path:
+    """Write pictures [H, W, 3] uint8, ``fps`` a second, over and over; the format goes up to 50."""
+    from PIL import Image
+
+    first, *others = (Image.fromarray(frame) for frame in frames)
+    milliseconds = max(20, round(1000 / fps))
+
+    def fill(file: BinaryIO) -> None:
+        first.save(file, format="gif", save_all=True, append_images=others, duration=milliseconds, loop=0)
+
+    return _write(path, fill)
 
 
 def read_npz(path: str | os.PathLike[str], key: str = "path") -> dict[str, np.ndarray]:

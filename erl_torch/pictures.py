@@ -13,6 +13,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.colors import LinearSegmentedColormap, Normalize, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
+from matplotlib.ticker import EngFormatter
 
 from erl_torch.envs.grid_world import TILES, GridWorld
 
@@ -176,9 +177,14 @@ class BandLine(NamedTuple):
     exact: Sequence[float | None]  # at each x, drawn dashed
 
 
-def bands(panels: Mapping[str, Sequence[BandLine]], x_label: str, title: str, markers: bool = False) -> np.ndarray:
-    """Statistics over replicas, a panel for each label: mean, quartiles (shaded), extremes (thin)."""
-    figure, all_axes = _panels(len(panels), title, "mean; shaded: quartiles; thin: extremes; dashed: exact")
+def bands(
+    panels: Mapping[str, Sequence[BandLine]], x_label: str, title: str, markers: bool = False, card: bool = False
+) -> np.ndarray:
+    """Statistics over replicas, a panel for each label: mean, quartiles (shaded), extremes (thin).
+
+    ``card``: small enough for a card of TensorBoard's, which takes one panel.
+    """
+    figure, all_axes = _panels(len(panels), title, "mean; shaded: quartiles; thin: extremes; dashed: exact", card)
     for axes, (label, lines) in zip(all_axes, panels.items(), strict=True):
         for i, line in enumerate(lines):
             colour = COLOURS[i % len(COLOURS)]
@@ -195,32 +201,28 @@ def bands(panels: Mapping[str, Sequence[BandLine]], x_label: str, title: str, ma
         spread = [x for line in lines for x in line.x]
         if markers and min(spread) > 0 and max(spread) / min(spread) >= 20:
             axes.set_xscale("log")
+        if not markers:
+            axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         _plain(axes, x_label, label)
         if len(lines) > 1 and axes is all_axes[0]:
             axes.legend(fontsize=7, frameon=False)
     return _pixels(figure)
 
 
-def shrunk(picture: np.ndarray, max_px: int = MAX_PX) -> np.ndarray:
-    """A picture [H, W, 3] in whole fractions of its size, at most about ``max_px`` wide."""
-    n = max(1, round(picture.shape[1] / max_px))
-    height, width = (size // n * n for size in picture.shape[:2])
-    blocks = picture[:height, :width].reshape(height // n, n, width // n, n, 3)
-    return np.asarray(blocks.mean((1, 3)).round(), dtype=np.uint8)
-
-
-def _panels(n: int, title: str, caption: str) -> tuple[Figure, list[Axes]]:
+def _panels(n: int, title: str, caption: str, card: bool) -> tuple[Figure, list[Axes]]:
     columns = 1 if n == 1 else 2
     rows = -(-n // columns)
-    width, height = 4.6 * columns, 2.9 * rows + 0.6
-    figure = Figure(figsize=(width, height), dpi=130)
+    panel = 3.4 if card else 4.6  # inches
+    width, height = panel * columns, 2.9 * rows + 0.6
+    figure = Figure(figsize=(width, height), dpi=DPI if card else 130)
     panels = []
     for i in range(n):
         row, column = divmod(i, columns)
-        left, bottom = (4.6 * column + 0.85) / width, (2.9 * (rows - 1 - row) + 0.55) / height
-        panels.append(figure.add_axes((left, bottom, 3.55 / width, 2.15 / height)))
-    figure.text(0.85 / width, 1 - 0.28 / height, title, fontsize=11, weight="bold")
-    figure.text(0.85 / width, 1 - 0.48 / height, caption, fontsize=8, color="#666666")
+        left, bottom = (panel * column + 0.85) / width, (2.9 * (rows - 1 - row) + 0.55) / height
+        panels.append(figure.add_axes((left, bottom, (panel - 1.05) / width, 2.15 / height)))
+    left = (0.1 if card else 0.85) / width
+    figure.text(left, 1 - 0.28 / height, title, fontsize=9 if card else 11, weight="bold")
+    figure.text(left, 1 - 0.48 / height, caption, fontsize=8, color="#666666")
     return figure, panels
 
 
@@ -288,7 +290,7 @@ def _grid_axes(grid: GridWorld, title: str, max_px: int, bar: bool = False) -> t
     rows, cols = grid.shape
     top, right = 24, 80 if bar else 6  # px: the title's line, the colour bar
     px = min((max_px - top - 6) / rows, (max_px - right - 6) / cols)  # a tile
-    width, height = max(px * cols + right + 6, 220), px * rows + top + 6
+    width, height = max(px * cols + right + 6, 340), px * rows + top + 6
     figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI)
     axes = figure.add_axes((6 / width, 6 / height, 1 - (right + 6) / width, 1 - (top + 6) / height))
     figure.text(0.5, 1 - 6 / height, title, fontsize=8, ha="center", va="top")

@@ -26,7 +26,7 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from erl_torch import checks, pictures
-from erl_torch.board import Board, replica_layout
+from erl_torch.board import Board, hyperparameters, replica_layout
 from erl_torch.checkpoint import Checkpoints
 from erl_torch.checks import InputError
 from erl_torch.evaluation import Judge, evaluate
@@ -43,11 +43,12 @@ from erl_torch.training import (
     SMALL,
     SafePoint,
     World,
-    flat,
+    episode_model,
     learning_bar,
     make_env,
     make_learner,
     make_world,
+    mean_return,
     recorded,
     versions,
     where,
@@ -111,33 +112,36 @@ def train_replicas(cfg: DictConfig, directory: Path, safe_point: SafePoint, save
         n_experience = max(_lengths(experience))
         judge = _Judges(cfg, env, world, prior, [one.beta for one in learners], seeds, threads)
 
+        exact = _exact(cfg, judge, groups)
+        record = _Record(groups, exact)
         stream = None if isinstance(experience, Simulation) else [data.checksum() for data in _recorded(experience)]
         found = saved.start()
         if found and found["digest"] != stream:
             raise InputError("experience", "another stream", "the one that the run in its directory began with")
-        record = _Record(groups)
         stopped: BaseException | None = None
         state: Any = None
         history: list[dict[str, np.ndarray]] = []
         learning = 0.0
         varied = {f"vary.{key}": values for key, values in _plain(cfg.vary).items()}
-        settings = flat({**cfg.learner, **varied, "seed": cfg.seed, "n_replicas": cfg.n_replicas})
-        layout = replica_layout([g.name for g in groups[:MOST_LOGGED]])
-        with Board(directory, settings, layout, found["events"] if found else 0) as board:
-            if found:
-                state, history, learning = found["state"], found["history"], found["learning"]
-                record.steps, record.rows, record.alive = found["record"]
-                judge.restore(found["evaluation"])
-                began -= found["seconds"]
-            else:
-                board.text("configuration", f"```yaml\n{OmegaConf.to_yaml(cfg, resolve=True)}```")
-                record.add(0, judge(np.repeat(prior[None], len(replicas), axis=0), True), board)
+        settings = hyperparameters(cfg, n_replicas=cfg.n_replicas, n_experience=n_experience, **varied)
+        first = {} if found else judge(np.repeat(prior[None], len(replicas), axis=0), True)
+        if found:
+            state, history, learning = found["state"], found["history"], found["learning"]
+            record.restore(found["record"])
+            judge.restore(found["evaluation"])
+            began -= found["seconds"]
+        logged = [*learners[0].init(n_states, n_actions).metrics(), *first]
+        boards = replica_layout({g.name: known for g, known in zip(groups[:MOST_LOGGED], exact, strict=False)}, logged)
+        with Board(directory, settings, boards, found["events"] if found else 0) as board:
+            if not found:
+                board.texts(cfg)
+                record.add(0, first, board)
 
             def snapshot() -> dict[str, Any]:
                 return {
                     "state": state,
                     "history": history,
-                    "record": (record.steps, record.rows, record.alive),
+                    "record": record.content(),
                     "evaluation": judge.generators(),
                     "events": board.flush(),
                     "learning": learning,
@@ -174,17 +178,23 @@ def train_replicas(cfg: DictConfig, directory: Path, safe_point: SafePoint, save
                 assert stopped is not None
                 raise stopped
             solution = replicas.solution(state, history)
-            exact = _exact(cfg, judge.model, groups, prior, cfg.evaluation.horizon)
             title = f"{cfg.env.name}, {cfg.learner.name}: {cfg.n_replicas} replicas"
-            drawn = {"bands": pictures.bands(record.curves(exact), "tuples streamed, each replica", title)}
+            drawn = [("bands", record.curves(exact), "tuples streamed, each replica", title)]
             if cfg.vary:
                 key, panels = _sweep(groups, record, exact)
-                drawn["sweep"] = pictures.bands(panels, key, f"{title}, at the end", markers=True)
-            for name, picture in drawn.items():
-                write_png(directory / f"{name}.png", picture)
-                board.picture(name, pictures.shrunk(picture), state.n_tuples)
+                drawn.append(("sweep", panels, key, f"{title}, at the end"))
+            for name, panels, x_label, heading in drawn:
+                markers = name == "sweep"
+                whole = pictures.bands({QUANTITIES[k]: v for k, v in panels.items()}, x_label, heading, markers)
+                write_png(directory / f"{name}.png", whole)
+                for k, lines in panels.items():  # on TensorBoard's small cards one panel can be read
+                    card = pictures.bands({QUANTITIES[k]: lines}, x_label, heading, markers, card=True)
+                    board.picture(f"{name}/{k}", card, state.n_tuples)
             done = int(history[-1]["n_tuples"].sum())
             board.scalars({"time/tuples_per_second": done / max(learning, 1e-9)}, state.n_tuples)
+            board.scalars(_final(groups, record, exact), state.n_tuples)
+            if solution.failures:
+                board.failed()
 
     solution.save(directory / "replicas.npz", record.arrays() | {"seed": np.array(seeds), **_columns(groups)})
     objectives = [record.statistics(group).get("objective") for group in groups]
@@ -327,9 +337,7 @@ class _Judges:
         if world.mdp is not None and world.mdp.transition.nnz > e.exact_up_to:
             self.model = None
             print("note: a large model (evaluation.exact_up_to): episodes are played instead", file=sys.stderr)
-        # An episode's return is the model's where the environment is the model.
-        endless = known_mdp(env) is not None and not getattr(env.unwrapped, "ends", np.zeros(1)).any()
-        self.episode = None if self.model is None else world.episode or (world.mdp if endless else None)
+        self.episode = None if self.model is None else episode_model(env, world)
 
     def generators(self) -> list[Any]:
         """States of the generators that play episodes."""
@@ -370,20 +378,22 @@ class _Judges:
         return found
 
 
-def _exact(
-    cfg: DictConfig, model: TabularMDP | None, groups: list[Group], prior: np.ndarray, horizon: int
-) -> list[dict[str, float]]:
+def _exact(cfg: DictConfig, judges: _Judges, groups: list[Group]) -> list[dict[str, float]]:
     """What is known of the optimum of each group, by quantity: of a small known model."""
+    model = judges.model
     if model is None or not cfg.evaluation.certify or model.n_states > SMALL:
         return [{} for _ in groups]
-    judge = Judge(model, prior, horizon)
+    judge = Judge(model, judges.prior, judges.horizon)
     known: dict[float, dict[str, float]] = {}
     for beta in {group.beta for group in groups}:
-        best = solve_soft_bellman(model, beta, prior)
+        best = solve_soft_bellman(model, beta, judges.prior)
         known[beta] = {}
         if best.status is Status.CONVERGED and best.theta is not None:
-            reward = judge.reward_per_step(best.policy.numpy())
-            known[beta] = {"theta": best.theta, "objective": -best.theta, "reward_per_step": reward}
+            policy = best.policy.numpy()
+            known[beta] = {"theta": best.theta, "delta_max": best.reward_bias_max, "objective": -best.theta}
+            known[beta]["reward_per_step"] = judge.reward_per_step(policy)
+            if judges.episode is not None:
+                known[beta]["return"] = mean_return(judges.episode, judges.horizon, policy)
     return [known[group.beta] for group in groups]
 
 
@@ -431,11 +441,20 @@ def statistics(values: np.ndarray) -> dict[str, float]:
 class _Record:
     """Figures of all replicas, record by record."""
 
-    def __init__(self, groups: list[Group]) -> None:
-        self.groups = groups
+    def __init__(self, groups: list[Group], exact: list[dict[str, float]]) -> None:
+        self.groups, self.exact = groups, exact
+        self.prior: dict[str, float] = {}  # by tag
         self.steps: dict[str, list[int]] = {}
         self.rows: dict[str, list[np.ndarray]] = {}
         self.alive: dict[str, list[np.ndarray]] = {}
+
+    def content(self) -> tuple[Any, ...]:
+        """What a checkpoint keeps."""
+        return self.prior, self.steps, self.rows, self.alive
+
+    def restore(self, content: tuple[Any, ...]) -> None:
+        """Go on from ``content``."""
+        self.prior, self.steps, self.rows, self.alive = content
 
     def add(self, step: int, measured: Mapping[str, np.ndarray], board: Board, alive: np.ndarray | None = None) -> None:
         for name in QUANTITIES:
@@ -446,11 +465,16 @@ class _Record:
             self.steps.setdefault(name, []).append(step)
             self.rows.setdefault(name, []).append(values)
             self.alive.setdefault(name, []).append(good)
-            for group in self.groups[:MOST_LOGGED]:
+            for group, known in zip(self.groups[:MOST_LOGGED], self.exact, strict=False):
                 inside = values[group.members][good[group.members]]
-                if inside.size:
-                    found = statistics(inside)
-                    board.scalars({f"{group.name}/{name}_{key}": found[key] for key in LOGGED}, step)
+                if not inside.size:
+                    continue
+                found, tag = statistics(inside), f"{group.name}/{name}"
+                if step == 0:
+                    self.prior[tag] = found["mean"]
+                lines = {"prior": self.prior.get(tag), "optimal": known.get(name)}
+                board.scalars({f"{tag}_{key}": found[key] for key in LOGGED}, step)
+                board.scalars({f"{tag}_{key}": value for key, value in lines.items() if value is not None}, step)
 
     def statistics(self, group: Group) -> dict[str, Any]:
         """Of the last record: statistics by quantity, replicas that count."""
@@ -462,8 +486,8 @@ class _Record:
         return found
 
     def curves(self, exact: list[dict[str, float]]) -> dict[str, list[pictures.BandLine]]:
-        """For ``pictures.bands``: quantity with its unit -> a line a group."""
-        shown = {}
+        """For ``pictures.bands``: quantity -> a line a group."""
+        shown: dict[str, list[pictures.BandLine]] = {}
         for name in ("theta", "delta_max", "reward_per_step", "objective", "return"):
             if name not in self.rows or (name == "return" and "reward_per_step" in self.rows):
                 continue
@@ -476,7 +500,7 @@ class _Record:
                 ]
                 steps, found = zip(*points, strict=True) if points else ((), ())
                 lines.append(pictures.BandLine(group.title, steps, found, [known.get(name)] * len(steps)))
-            shown[QUANTITIES[name]] = lines
+            shown[name] = lines
         return shown
 
     def line(self) -> str:
@@ -495,7 +519,21 @@ class _Record:
         return found | {f"record_step/{name}": np.array(steps) for name, steps in self.steps.items()}
 
 
-LOGGED = ("mean", "q25", "q75", "min", "max")
+def _final(groups: list[Group], record: _Record, exact: list[dict[str, float]]) -> dict[str, float]:
+    """Means over the replicas of the group with the best objective, by tag."""
+    found = [record.statistics(group) for group in groups]
+    able = [g for g in range(len(groups)) if found[g].get("objective")]
+    if not able:
+        return {}
+    best = max(able, key=lambda g: found[g]["objective"]["mean"])
+    names = ("theta", "objective", "reward_per_step", "return")
+    final = {name: found[best][name]["mean"] for name in names if found[best].get(name)}
+    if "objective" in exact[best]:
+        final["gap"] = exact[best]["objective"] - final["objective"]
+    return {f"Final/{name}": value for name, value in final.items()}
+
+
+LOGGED = ("mean", "median", "q25", "q75", "min", "max")
 
 
 def _columns(groups: list[Group]) -> dict[str, np.ndarray]:
@@ -511,7 +549,7 @@ def _columns(groups: list[Group]) -> dict[str, np.ndarray]:
 def _sweep(
     groups: list[Group], record: _Record, exact: list[dict[str, float]]
 ) -> tuple[str, dict[str, list[pictures.BandLine]]]:
-    """The first setting that varies, and quantity with its unit -> a line for each combination of the others."""
+    """The first setting that varies, and quantity -> a line for each combination of the others."""
     key = next(iter(groups[0].settings))
     panels: dict[str, list[pictures.BandLine]] = {}
     for name in ("theta", "objective", "delta_max"):
@@ -522,9 +560,7 @@ def _sweep(
                 rest = ", ".join(f"{k} {v:g}" for k, v in group.settings.items() if k != key)
                 points.setdefault(rest, []).append((group.settings[key], found, known.get(name)))
         if points:
-            panels[QUANTITIES[name]] = [
-                pictures.BandLine(rest, *zip(*row, strict=True)) for rest, row in points.items()
-            ]
+            panels[name] = [pictures.BandLine(rest, *zip(*row, strict=True)) for rest, row in points.items()]
     return key, panels
 
 

@@ -37,7 +37,7 @@ class Solution:
     """A policy with the tables and the record behind it (symbols as in ``erl_torch.learners.algorithm_s1``).
 
     ``history`` has one array a logged quantity, one entry an epoch. theta and rho are None where the learner
-    estimates neither (discounted learners).
+    estimates neither (discounted learners); bounds, gap and k where they are not known.
     """
 
     policy: torch.Tensor  # [S, A], rows sum to 1

@@ -24,7 +24,7 @@ from tqdm import tqdm
 
 import erl_torch
 from erl_torch import checks, kernels, pictures
-from erl_torch.board import EXACT_LAYOUT, LEARNER_LAYOUT, S1_LAYOUT, Board
+from erl_torch.board import Board, hyperparameters, layout
 from erl_torch.chains import SingularChainError
 from erl_torch.checkpoint import Checkpoints
 from erl_torch.checks import InputError
@@ -36,13 +36,13 @@ from erl_torch.envs.grid_world import GridWorld
 from erl_torch.evaluation import Evaluation, evaluate, reward_per_step
 from erl_torch.experience import collect, record
 from erl_torch.files import read_npy, write_json
-from erl_torch.learners import LEARNERS, AlgorithmS1, Exact, ExactState, NonFiniteError, S1State
+from erl_torch.learners import LEARNERS, Exact, ExactState, NonFiniteError, S1State
 from erl_torch.mdp import TabularMDP, check_policy
 from erl_torch.models import MeanRewardWarning, absorbing, known_mdp, sizes, tabular_mdp
 from erl_torch.recordings import FileRecording, open_recording
 from erl_torch.rng import Streams, streams
 from erl_torch.solution import Solution, Status
-from erl_torch.solvers import certify
+from erl_torch.solvers import certify, solve_soft_bellman
 from erl_torch.transitions import Recording
 from erl_torch.uncertainty import Estimate, theta_uncertainty
 
@@ -101,28 +101,36 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
         prior = check_policy("learner.prior_policy", learner.prior_policy, n_states, n_actions)
         run = (_Solving if isinstance(learner, Exact) else _Learning)(cfg, env, world, learner, rng, prior, safe_point)
 
+        e = cfg.evaluation
+        horizon = min(e.horizon, (env.spec and env.spec.max_episode_steps) or e.horizon)
+
         def measure(policy: torch.Tensor) -> Evaluation:
-            e = cfg.evaluation
-            horizon = min(e.horizon, (env.spec and env.spec.max_episode_steps) or e.horizon)
-            exact = None if world.episode is None else functools.partial(_mean_return, world.episode, horizon)
+            exact = None if world.episode is None else functools.partial(mean_return, world.episode, horizon)
             return evaluate(env, policy, learner.beta, rng.evaluation, e.n_episodes, horizon, prior, judge, exact)
 
-        found = run.check(saved.start())
         start = state = learner.init(n_states, n_actions)
         history: list[dict[str, float]] = []
         stopped: BaseException | None = None
         clock = _Stopwatch()
-        hyperparameters = flat({**cfg.learner, "seed": cfg.seed, "n_experience": run.n_experience})
-        with Board(directory, hyperparameters, run.layout, found["events"] if found else 0) as board:
+        best = run.optimum(judge, prior) if e.certify else None
+        estimate = run.uncertainty(prior) if e.certify else None
+        episode = episode_model(env, world)
+        found = run.check(saved.start())
+        if found:
+            state, history, first, last = (found[key] for key in ("state", "history", "first", "last"))
+            rng.evaluation.bit_generator.state = found["evaluation"]
+            clock.seconds, began = found["learning"], began - found["seconds"]
+        else:
+            first = last = measure(state.policy)
+        lines = evaluation_tags(first, "prior") | _optimal_tags(best, judge, episode, horizon) | _data_tags(estimate)
+        boards = layout([*run.names(start), *evaluation_tags(first)], lines)
+        settings = hyperparameters(cfg, n_experience=run.n_experience)
+        with Board(directory, settings, boards, found["events"] if found else 0) as board:
+            board.lines(lines)
             drawer = _Drawer(board, getattr(env.unwrapped, "grid", None)) if cfg.evaluation.pictures else None
-            if found:
-                state, history, first, last = (found[key] for key in ("state", "history", "first", "last"))
-                rng.evaluation.bit_generator.state = found["evaluation"]
-                clock.seconds, began = found["learning"], began - found["seconds"]
-            else:
-                board.text("configuration", f"```yaml\n{OmegaConf.to_yaml(cfg, resolve=True)}```")
-                first = last = measure(state.policy)
-                board.scalars(run.tags(state, first), 0)
+            if not found:
+                board.texts(cfg)
+                board.record(run.tags(state, first), 0)
                 if drawer:
                     drawer.policy(state, 0, "prior policy")
 
@@ -149,7 +157,7 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
                         step, milestone = run.step(state), run.milestone(state)
                         if milestone or len(history) % cfg.evaluation.every == 0:
                             last = measure(state.policy)
-                            board.scalars(run.tags(state, last), step)
+                            board.record(run.tags(state, last), step)
                         if milestone and drawer:
                             drawer.policy(state, step, f"policy, {milestone}")
                         if milestone and drawer and hasattr(state, "reward_bias"):
@@ -166,15 +174,19 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
                 if run.digest is not None and history and not isinstance(error, NonFiniteError):
                     saved.offer(run.step(state), snapshot, now=True)
             solution = run.solution(state, history, stopped)
-            if judge is not None and solution.theta_bounds is None and cfg.evaluation.certify:
-                solution = certify(solution, judge, learner.beta, prior)
-            estimate = run.uncertainty(prior) if cfg.evaluation.certify else None
-            if estimate is not None:
-                interval = dict(zip(("lower", "upper"), estimate.interval(), strict=True))
-                values = {"theta": estimate.value, **{f"theta_{k}": v for k, v in interval.items()}}
-                board.scalars({f"data/{k}": v for k, v in values.items()}, run.step(state))
+            if best is not None:
+                assert judge is not None
+                solution = certify(solution, judge, learner.beta, prior, best)
+            else:
+                for step in (0, run.step(state)):
+                    board.scalars(_optimal_tags(solution, judge, episode, horizon), step)
             rate = run.step(state) / max(clock.seconds, 1e-9)
             board.scalars({f"time/{run.unit}_per_second": rate}, run.step(state))
+            final = {"theta": solution.theta, "gap": solution.gap}
+            known = {f"Final/{name}": value for name, value in final.items() if value is not None}
+            board.scalars(evaluation_tags(last, "Final") | known, run.step(state))
+            if isinstance(stopped, NonFiniteError):
+                board.failed()
 
     solution.save(directory / "solution.npz")
     seconds = time.perf_counter() - began
@@ -213,7 +225,6 @@ class _Learning:
         safe_point: SafePoint,
     ) -> None:
         self.learner, self.name = learner, cfg.learner.name
-        self.layout = S1_LAYOUT if isinstance(learner, AlgorithmS1) else LEARNER_LAYOUT
         self.sizes = sizes(world.source)
         self.n_skipped = 0
         self.data: Recording
@@ -243,10 +254,14 @@ class _Learning:
             return ""
         return f"biasing iteration {state.bias_iteration}" if hasattr(state, "bias_iteration") else "last pass"
 
-    def tags(self, state: Any, measured: Evaluation) -> dict[str, float]:
+    def names(self, state: Any) -> dict[str, float]:
+        """What the learner logs, by tag."""
         prefix = "s1" if isinstance(state, S1State) else "learner"
-        known = {k: v for k, v in state.metrics().items() if k not in ("epoch", "n_tuples") and np.isfinite(v)}
-        return {f"{prefix}/{name}": value for name, value in known.items()} | _evaluation_tags(measured)
+        return {f"{prefix}/{k}": v for k, v in state.metrics().items() if k not in ("epoch", "n_tuples")}
+
+    def tags(self, state: Any, measured: Evaluation) -> dict[str, float]:
+        known = {tag: value for tag, value in self.names(state).items() if np.isfinite(value)}
+        return known | evaluation_tags(measured)
 
     def postfix(self, state: Any) -> str:
         bias = f"bias {state.bias_iteration}/{self.learner.n_bias - 1} " if hasattr(state, "bias_iteration") else ""
@@ -260,6 +275,10 @@ class _Learning:
         failure = stopped if isinstance(stopped, NonFiniteError) else None
         solution: Solution = self.learner.solution(state, history, failure)
         return solution
+
+    def optimum(self, judge: TabularMDP | None, prior: np.ndarray) -> Solution | None:
+        """The exact answer to ``judge``, to compare with."""
+        return None if judge is None else solve_soft_bellman(judge, self.learner.beta, prior)
 
     def uncertainty(self, prior: np.ndarray) -> Estimate | None:
         """theta* with its error, as the counts of the stream alone have it; None where that is no small problem."""
@@ -275,7 +294,6 @@ class _Solving:
     """A run that solves the environment's model."""
 
     unit = "iterations"
-    layout = EXACT_LAYOUT
     n_experience = n_skipped = 0
     digest = None  # no stream, and no checkpoints: it begins anew
 
@@ -309,10 +327,12 @@ class _Solving:
             return f"biasing iteration {state.step - 1}"
         return f"Newton step {state.step}"
 
+    def names(self, state: ExactState) -> dict[str, float]:
+        return {f"exact/{name}": value for name, value in state.metrics().items()}
+
     def tags(self, state: ExactState, measured: Evaluation) -> dict[str, float]:
         # Nothing is proven at step 0; TensorBoard's band chart wants the same steps in all three tags.
-        known = state.metrics().items() if state.step else ()
-        return {f"exact/{name}": value for name, value in known} | _evaluation_tags(measured)
+        return (self.names(state) if state.step else {}) | evaluation_tags(measured)
 
     def postfix(self, state: ExactState) -> str:
         return f"theta {state.theta:.6f} in [{state.theta_bounds[0]:.6f}, {state.theta_bounds[1]:.6f}]"
@@ -323,8 +343,11 @@ class _Solving:
     def solution(self, state: ExactState, history: list[dict[str, float]], stopped: BaseException | None) -> Solution:
         return self.learner.solution(self.mdp, state, history, stopped is not None)
 
+    def optimum(self, judge: TabularMDP | None, prior: np.ndarray) -> None:
+        """The run itself finds it."""
+
     def uncertainty(self, prior: np.ndarray) -> None:
-        return None
+        """There are no data."""
 
 
 def learning_bar(total: int | None, unit: str) -> tqdm:
@@ -334,12 +357,40 @@ def learning_bar(total: int | None, unit: str) -> tqdm:
     )  # fmt: skip
 
 
-def _evaluation_tags(measured: Evaluation) -> dict[str, float]:
+def evaluation_tags(measured: Evaluation, prefix: str = "eval") -> dict[str, float]:
     return {
-        "eval/return": measured.mean_return,
-        "eval/reward_per_step": measured.reward_per_step,
-        "eval/objective": measured.objective,
+        f"{prefix}/return": measured.mean_return,
+        f"{prefix}/reward_per_step": measured.reward_per_step,
+        f"{prefix}/objective": measured.objective,
     }
+
+
+def _optimal_tags(
+    best: Solution | None, judge: TabularMDP | None, episode: TabularMDP | None, horizon: int
+) -> dict[str, float]:
+    """What ``best`` proves of theta*, and where the proof is complete the figures of its policy."""
+    if best is None or best.theta is None or best.theta_bounds is None:
+        return {}
+    low, high = best.theta_bounds
+    found = {"theta": best.theta, "theta_lower": low, "theta_upper": high}
+    if best.status is Status.CONVERGED:
+        found |= {"objective": -best.theta, "delta_max": best.reward_bias_max}
+        found["delta_mean"] = float(best.reward_bias.mean())
+        if best.rho is not None and np.isfinite(best.rho):
+            found["rho"] = best.rho
+        if judge is not None:
+            policy = best.policy.numpy()
+            found["reward_per_step"] = reward_per_step(judge, policy, horizon)
+            if episode is not None:
+                found["return"] = mean_return(episode, horizon, policy)
+    return {f"optimal/{name}": value for name, value in found.items()}
+
+
+def _data_tags(estimate: Estimate | None) -> dict[str, float]:
+    if estimate is None:
+        return {}
+    low, high = estimate.interval()
+    return {"data/theta": estimate.value, "data/theta_lower": low, "data/theta_upper": high}
 
 
 def _say(milestone: str, state: Any, measured: Evaluation) -> None:
@@ -386,13 +437,15 @@ def _group(name: str) -> Iterator[None]:
         raise error.within(name) from error
 
 
-def make_env(cfg: DictConfig) -> gym.Env[Any, Any]:
+def make_env(cfg: DictConfig, render_mode: str | None = None) -> gym.Env[Any, Any]:
     """The environment of ``cfg``. Raises InputError."""
     keys: Any = OmegaConf.to_container(cfg, resolve=True)
     arguments = keys["kwargs"] if "kwargs" in keys else {k: v for k, v in keys.items() if k not in NOT_ARGUMENTS}
     with _group("env"):
         if isinstance(arguments.get("wind"), str):
             arguments["wind"] = read_npy(arguments["wind"], "wind")
+        if render_mode is not None:
+            arguments["render_mode"] = render_mode
         try:
             env = gym.make(cfg.id, **arguments)
         except gym.error.Error as error:
@@ -456,7 +509,14 @@ def _control_world(cfg: DictConfig, env: gym.Env[Any, Any], safe_point: SafePoin
     return World(TabularMDP(mdp.transition, mdp.reward), mdp)
 
 
-def _mean_return(episode: TabularMDP, horizon: int, policy: np.ndarray) -> float:
+def episode_model(env: gym.Env[Any, Any], world: World) -> TabularMDP | None:
+    """The model whose rewards over the horizon are an episode's return; None where there is none."""
+    endless = known_mdp(env) is not None and not getattr(env.unwrapped, "ends", np.zeros(1)).any()
+    return world.episode or (world.mdp if endless else None)
+
+
+def mean_return(episode: TabularMDP, horizon: int, policy: np.ndarray) -> float:
+    """Expected return of an episode of at most ``horizon`` steps, which ``episode`` is the model of."""
     return horizon * reward_per_step(episode, policy, horizon)
 
 
@@ -598,6 +658,8 @@ def where(directory: Path) -> tuple[Path, Path | str]:
     """A run directory as a user would write it, and what to give TensorBoard."""
     with contextlib.suppress(ValueError):
         directory = directory.resolve().relative_to(Path.cwd())
+    if directory.parent.name.startswith("sweep-"):
+        return directory, directory.parent  # its runs side by side, by short names
     return directory, "runs" if directory.parts[0] == "runs" else directory
 
 
@@ -648,8 +710,3 @@ def _summary(
         lines.append(f"{'status':18}{Status[result['status'].upper()].value}")
         lines += [f"{'':18}{result['message']}"] if result["message"] else []
     return "\n".join(lines)
-
-
-def flat(values: dict[str, Any]) -> dict[str, Any]:
-    """Hyper-parameters as TensorBoard takes them: numbers, booleans and text."""
-    return {key: value if isinstance(value, (bool, int, float, str)) else str(value) for key, value in values.items()}

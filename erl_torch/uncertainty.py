@@ -78,7 +78,16 @@ class Estimate:
 
 
 def theta_uncertainty(model: EmpiricalMDP, beta: float, prior_policy: Any = None) -> Estimate:
-    """Plug-in estimate of theta* from counts. Raises InputError as ``EmpiricalMDP.problem``."""
+    """Plug-in estimate of theta* from counts, with its standard error (docs/theory.md, 4).
+
+    Args:
+        model: counts and mean rewards, of ``empirical_mdp``.
+        beta: inverse temperature, 1/reward, > 0.
+        prior_policy: [S, A], entries > 0; None is uniform.
+
+    Raises:
+        InputError: beta or prior out of range, or a stream that never returns to any state.
+    """
     part = model.problem(beta, prior_policy)
     policy = solve_problem(part.problem, model, prior_policy).policy.numpy()
     estimate = _plug_in(model, part, policy[part.problem.states])
@@ -87,6 +96,12 @@ def theta_uncertainty(model: EmpiricalMDP, beta: float, prior_policy: Any = None
 
 def policy_uncertainty(model: EmpiricalMDP, policy: Any, beta: float, prior_policy: Any = None) -> Estimate:
     """J(policy), the reward rate less KL/beta, as the counts have it, with its standard error.
+
+    Args:
+        model: counts and mean rewards, of ``empirical_mdp``.
+        policy: [S, A], rows sum to 1.
+        beta: inverse temperature, 1/reward, > 0.
+        prior_policy: [S, A], entries > 0; None is uniform.
 
     Raises:
         InputError: a policy [S, A] that takes an action never tried (in a state of the empirical problem).
@@ -110,6 +125,16 @@ def bootstrap_theta(
     """Estimate of theta* with the bootstrap's standard error and samples; the same seed gives the same samples.
 
     Samples whose model cannot be solved (reducible by the draw) are left out.
+
+    Args:
+        model: counts and mean rewards, of ``empirical_mdp``.
+        beta: inverse temperature, 1/reward, > 0.
+        prior_policy: [S, A], entries > 0; None is uniform.
+        n_resamples: whole number >= 2; each solves a model.
+        seed: a whole number, or a generator.
+
+    Raises:
+        InputError: an argument out of range, or fewer than two samples that can be solved.
     """
     checks.at_least("n_resamples", n_resamples, 2)
     rng = np.random.default_rng(seed)

@@ -416,7 +416,7 @@ def test_million_tuple_drift_stays_in_range():
 
 
 BAD = {
-    "beta": [0.0, -1.0, math.nan, math.inf, 1e4],
+    "beta": [0.0, -1.0, math.nan, math.inf, 1e4, 1e-300],
     "lr_u": [0.0, 1.5, math.nan],
     "lr_rho": [0.0, -0.1, math.inf],
     "lr_psi": [0.0, 1.0001],

@@ -1,7 +1,6 @@
 """Replicas against the same learners alone: bit for bit, for any experience, block, layout and number of threads."""
 
 import json
-import re
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
@@ -12,8 +11,8 @@ import pytest
 import torch
 from conftest import problems, random_mdp, random_policy
 from hypothesis import strategies as st
+from test_board import events, undocumented
 from test_config import composed
-from test_training import events
 
 from erl_torch import (
     AlgorithmS1,
@@ -390,12 +389,23 @@ def test_bands_are_the_statistics(finished):
     assert steps == [0, *range(5000, 30_001, 5000)]
 
 
-def test_every_tag_is_documented(finished):
-    text = (ROOT / "docs" / "logging.md").read_text()
-    tags = events(finished[0]).Tags()
-    for tag in [*tags["scalars"], *tags["images"]]:
-        name = re.sub(r"_(mean|q25|q75|min|max)$", "", tag.replace("replicas/", "GROUP/"))
-        assert f"`{name}" in text, tag
+def test_lines_of_optimum_and_prior(finished):
+    directory, result = finished
+    assert undocumented(directory) == set()
+    reader = events(directory)
+    (group,) = result["groups"]
+    steps = [e.step for e in reader.Scalars("replicas/objective_mean")]
+    first = reader.Scalars("replicas/return_mean")[0].value
+    for tag, value in [
+        ("objective_optimal", group["exact"]["objective"]),
+        ("theta_optimal", group["exact"]["theta"]),
+        ("return_prior", first),
+    ]:
+        found = reader.Scalars(f"replicas/{tag}")
+        assert [e.value for e in found] == pytest.approx([value] * len(found), rel=1e-6)
+        assert [e.step for e in found] == steps[len(steps) - len(found) :]
+    (gap,) = reader.Scalars("Final/gap")
+    assert gap.value == pytest.approx(group["exact"]["objective"] - group["objective"]["mean"], abs=1e-6)
 
 
 def test_settings_that_vary(tmp_path):
@@ -405,7 +415,8 @@ def test_settings_that_vary(tmp_path):
     ]
     tags = events(tmp_path).Tags()
     assert "beta_5-lr_u_0.01/theta_mean" in tags["scalars"]
-    assert set(tags["images"]) == {"bands", "sweep"}
+    assert {"bands/theta", "bands/objective", "sweep/theta", "sweep/delta_max"} < set(tags["images"])
+    assert undocumented(tmp_path) == set()
     one = train(composed(*SMALL, "learner.beta=5", "learner.lr_u=0.02", "seed=1"), tmp_path / "one")
     assert ReplicaSolution.load(tmp_path / "replicas.npz")[3].theta == one["theta"]
     mdp = __import__("erl_torch.envs.windy_cliff", fromlist=["WindyCliffEnv"]).WindyCliffEnv().mdp

@@ -54,7 +54,8 @@ def random_mazes(
     Args:
         n: whole number >= 0.
         size: rows and columns, >= 5.
-        n_traps: number of traps; None is ``density``, traps for each row length: round(size * density), half to even.
+        n_traps: number of traps; None takes ``density``.
+        density: traps for each row length, where n_traps is None: round(size * density), half to even.
         wind_level: first parameter of Beta(wind_level, 2), > 0.
         seed: whole number >= 0.
         trap_reward: reward of leaving a trap.

@@ -54,6 +54,11 @@ def rollout(
     """Play ``n_episodes`` under ``policy`` [S, A] from the original's own first states.
 
     Args:
+        task: as in ``estimate_mdp``.
+        policy: [S, A] over the cells; rows sum to 1.
+        n_episodes: whole number >= 1.
+        max_steps: steps at which an episode is cut off.
+        rng: draws first states and actions.
         bins, actions: as in ``estimate_mdp``, or ``UniformBins`` with other bounds; None is the task's own.
         reward: "original", or "cyclic" as in ``ControlEnv``.
 

@@ -16,7 +16,14 @@ class TabularEnv(gym.Env[np.int64, np.int64]):
     """Steps through a TabularMDP. It terminates in the states of ``ends`` alone; a time limit truncates.
 
     Observation: the state, Discrete(n_states). Action: Discrete(n_actions). Reward: ``mdp.reward[s, a]``.
-    ``ends`` [S] bool: any step from such a state ends the episode there, where ``mdp`` leads to the start.
+
+    Args:
+        mdp: the process.
+        render_mode: "ansi" or None.
+        ends: [S] bool: any step from such a state ends the episode there, where ``mdp`` leads to the start.
+
+    Raises:
+        InputError: an unknown render_mode.
     """
 
     metadata = {"render_modes": ["ansi"], "render_fps": 4}  # noqa: RUF012

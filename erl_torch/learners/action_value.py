@@ -125,7 +125,7 @@ class ActionValueLearner:
     exponential: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        checks.positive("beta", self.beta)
+        checks.temperature("beta", self.beta)
         if not (checks.is_number(self.power) and 0.5 < self.power <= 1):
             raise InputError("power", self.power, "a number in (0.5, 1]")
         checks.at_least("n_epochs", self.n_epochs, 1)

@@ -35,26 +35,28 @@ Exact rearrangements used by ``implementation="fast"`` (the literal twin is ``er
     division    with q = 1/rho line 11 is q <- q z' / ((1-lr_rho) z' + lr_rho g z(s',a') q): one division.
 
 What the listing leaves open, and what is done here
-    1. lr_rho has no value in the listing: None is lr_u / n_states, as in the authors' script.
-    2. Rescaling u is not in the listing: neutral, since the updates are homogeneous in u. Every
-       ``rescale_every`` tuples (fast: by powers of two, so no bit of rho or of the policy changes), and to
-       mean 1 after each epoch.
-    3. ``clip_rho``: rho <= max(1, exp(beta max r)) after each update. The script clips at 1, which holds
-       for r <= 0 only; the wider bound holds for any reward, because sum_s' p b = 1 and delta <= Delta.
-    4. ``rho_init``: "reset" sets rho = exp(-beta) in every biasing iteration (line 8), "carry" only once
-       (the script).
-    5. <psi> and <log psi> are carried over between biasing iterations (line 1 stands before the loop).
-    6. "Relative error" is the largest of |d<psi>|/<psi> and |d<log psi>|/(|<log psi>| + 1e-10) over all
-       pairs, from one epoch to the next.
-    7. ``self_loop``: where (s',a') = (s,a), line 11 sees the u that line 10 has just written ("new", the
-       listing read in order), or the one before ("old", the script).
-    8. n_bias counts all iterations, the unbiased first included: the script's n_bias_iter = 5 is 6 here.
-    9. ``unvisited``: a pair that never occurs keeps u = 1 of line 7, scaled along with the rest
-       ("initial": the listing, the script), or has the value that gives it exactly its prior probability
-       ("prior"). A state that never occurs keeps the prior policy either way.
-   10. Rewards that vary for the same (s,a) are used as they come: S1 averages exp(beta r), and is
-       optimistic about that noise.
-   11. Delta is the maximum over the pairs that occur.
+
+1. lr_rho has no value in the listing: None is lr_u / n_states, as in the authors' script.
+2. Rescaling u is not in the listing: neutral, since the updates are homogeneous in u. Every
+   ``rescale_every`` tuples (fast: by powers of two, so no bit of rho or of the policy changes), and to
+   mean 1 after each epoch.
+3. ``clip_rho``: rho <= max(1, exp(beta max r)) after each update. The script clips at 1, which holds
+   for r <= 0 only; the wider bound holds for any reward, because sum_s' p b = 1 and delta <= Delta, once
+   <psi> has converged; before, the clip only keeps rho near where its limit lies (docs/theory.md, 5).
+4. ``rho_init``: "reset" sets rho = exp(-beta) in every biasing iteration (line 8), "carry" only once
+   (the script).
+5. <psi> and <log psi> are carried over between biasing iterations (line 1 stands before the loop).
+6. "Relative error" is the largest of |d<psi>|/<psi> and |d<log psi>|/(|<log psi>| + 1e-10) over all
+   pairs, from one epoch to the next.
+7. ``self_loop``: where (s',a') = (s,a), line 11 sees the u that line 10 has just written ("new", the
+   listing read in order), or the one before ("old", the script).
+8. n_bias counts all iterations, the unbiased first included: the script's n_bias_iter = 5 is 6 here.
+9. ``unvisited``: a pair that never occurs keeps u = 1 of line 7, scaled along with the rest
+   ("initial": the listing, the script), or has the value that gives it exactly its prior probability
+   ("prior"). A state that never occurs keeps the prior policy either way.
+10. Rewards that vary for the same (s,a) are used as they come: S1 averages exp(beta r), and is
+   optimistic about that noise.
+11. Delta is the maximum over the pairs that occur.
 """
 
 from __future__ import annotations
@@ -212,7 +214,7 @@ class AlgorithmS1:
     device: str = "cpu"
 
     def __post_init__(self) -> None:
-        checks.positive("beta", self.beta)
+        checks.temperature("beta", self.beta)
         checks.step_size("lr_u", self.lr_u)
         if self.lr_rho is not None:
             checks.step_size("lr_rho", self.lr_rho)

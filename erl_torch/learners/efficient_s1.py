@@ -16,6 +16,7 @@ The published steps stay about a hundred times further away: their <psi> remembe
 backup is noisy also at the end.
 
 Options, each alone (published: all off, ``unvisited="initial"``; then this *is* Algorithm S1, tested)
+
     1. ``sample_mean_psi``  <psi> and <log psi> are means over all visits (step 1/n), from counts: no passes, and with
                             them lr_psi, psi_tol and max_psi_epochs go. Off: lines 2-3.
     2. ``expected_backup``  y(s') above in place of u(s',a') psi(s'). a' is not used, so any behaviour policy with
@@ -222,7 +223,7 @@ class EfficientS1:
     unvisited: str = "exclude"
 
     def __post_init__(self) -> None:
-        checks.positive("beta", self.beta)
+        checks.temperature("beta", self.beta)
         checks.step_size("lr_u", self.lr_u)
         if self.lr_rho is not None:
             checks.step_size("lr_rho", self.lr_rho)

@@ -71,7 +71,7 @@ class Exact:
     prior_policy: torch.Tensor | np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        checks.positive("beta", self.beta)
+        checks.temperature("beta", self.beta)
         checks.one_of("method", self.method, ("biasing", "soft_bellman"))
         checks.positive("tol", self.tol)
         checks.at_least("max_steps", self.max_steps, 1)

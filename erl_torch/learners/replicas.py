@@ -48,6 +48,8 @@ class Simulation:
     """A stream of ``mdp`` for each seed: ``n_episodes`` of ``episode_length`` steps, a' from the learners' prior.
 
     Args:
+        mdp: what is simulated; its sizes are those of the learners.
+        n_episodes, episode_length: whole numbers >= 1; their product is the length of each stream.
         seeds: whole numbers >= 0, one a replica.
         behaviour_policy: [S, A]; None is the prior.
         keep: hold the tuples in memory (true), sample them again in every pass (false), or what fits 1 GiB (None).

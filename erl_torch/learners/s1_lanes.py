@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from erl_torch import kernels
+from erl_torch import checks, kernels
 from erl_torch.checks import InputError
 from erl_torch.learners import s1_torch
 from erl_torch.learners.algorithm_s1 import AlgorithmS1, S1State, S1Stream, gains, line_12, positive, reward_biases
@@ -301,7 +301,7 @@ class Engine:
 
         def prepared(r: int) -> S1Stream:
             # Streams are the same at any beta, but for what is made of beta below; at this one nothing overflows.
-            learner: AlgorithmS1 = replace(learners[r], beta=1e-300)
+            learner: AlgorithmS1 = replace(learners[r], beta=checks.SMALLEST_BETA)
             return learner.prepare(tuples_of(self.experience, r, self.prior), self.n_states, self.n_actions)
 
         if shared:

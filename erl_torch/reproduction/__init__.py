@@ -19,7 +19,9 @@ ARTIFACTS = {
     "figure_3": "control tasks: returns in the original environments",
     "figure_4": "dynamics shift",
     "figure_5": "Algorithm S1 on the windy cliff",
+    "figure_s1": "spread of the counts of Table S1",
     "figure_s2": "the control tasks",
+    "table_s1": "random windy mazes: biasing iterations",
     "table_s2": "control tasks: biasing iterations",
 }
 SCALES = ("quick", "full")

@@ -30,11 +30,14 @@ from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.mdp import TabularMDP
 from erl_torch.solution import Solution, Status
+from erl_torch.solvers.compiled import NewtonPattern
 from erl_torch.solvers.eigenpair import solve_log_perron
 from erl_torch.solvers.problem import Problem, soft_backup, theta_bounds
 from erl_torch.solvers.result import bias, exact_solution, how_it_ended, reducible_solution
 
 KL_TOLERANCE = 1e-6
+RTOL = 1e-13  # spread of the bounds on an eigenvalue
+MAX_NEWTON_STEPS = 60
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,19 +111,33 @@ def iterate_biasing(
     target: TabularMDP | None = None,
     max_steps: int = 200,
 ) -> Iterator[BiasingState]:
-    """Yield every biasing iteration; ends after ``max_steps``, or when rounding ends progress."""
+    """Yield every biasing iteration; ends after ``max_steps``, or when rounding ends progress.
+
+    Nothing is yielded where the states that the start leads to are not one class.
+
+    Args:
+        mdp, beta, prior_policy, target: as in ``solve_biasing``.
+        max_steps: biasing iterations at most.
+
+    Raises:
+        InputError: an argument out of range, or a target of another shape.
+    """
     problem = _problem(mdp, beta, prior_policy, target)
     checks.at_least("max_steps", max_steps, 1)
     ref = problem.regeneration_state()
     if ref is None or len(problem.classes[1]) > 1:
         return
-    known = Problem.of(mdp, beta, prior_policy) if target is not None else problem
+    pattern = NewtonPattern.of(problem.transition, problem.n_actions)
+    known, known_pattern = problem, pattern
+    if target is not None:
+        known = Problem.of(mdp, beta, prior_policy)
+        known_pattern = NewtonPattern.of(known.transition, known.n_actions)
     value = np.zeros(problem.n_states)
     lower, upper = -np.inf, np.inf
     shift_before = np.inf
     for k in range(max_steps):
-        at = known if k == 0 else problem
-        h, bounds, status, newton_steps = _eigenvector(at, value)
+        at, its_pattern = (known, known_pattern) if k == 0 else (problem, pattern)
+        h, bounds, status, newton_steps = _eigenvector(at, value, its_pattern, ref)
         log_psi = -beta * value
         # The policy and the dynamics that are optimal in the biased problem.
         log_mean, kl, tilted = at.tilt(h)
@@ -164,16 +181,23 @@ def _problem(mdp: TabularMDP, beta: float, prior_policy: Any, target: TabularMDP
     return problem
 
 
-def _eigenvector(problem: Problem, value: np.ndarray) -> tuple[np.ndarray, tuple[float, float], Status, int]:
+def _eigenvector(
+    problem: Problem, value: np.ndarray, pattern: NewtonPattern | None, ref: int
+) -> tuple[np.ndarray, tuple[float, float], Status, int]:
     """Right eigenvector of M_V as its logarithm, with bounds on beta G(V)."""
     log_weight = problem.beta * (problem.action_value(value) - value[:, None])
+    if pattern is not None:
+        found = pattern.eigenvector(log_weight + np.log(problem.prior), ref, RTOL, MAX_NEWTON_STEPS)
+        if found is not None:
+            h, bounds, steps = found
+            return h, bounds, Status.CONVERGED, steps
 
     def tilt(h: np.ndarray) -> tuple[np.ndarray, sp.csr_array]:
         log_mean, _, tilted = problem.tilt(h)
         backed_up, choice = soft_backup(log_weight + log_mean.reshape(log_weight.shape), problem.prior, 1.0)
         return backed_up, problem.chain(choice, tilted)
 
-    return solve_log_perron(tilt, np.zeros(problem.n_states), 1e-13, 60)
+    return solve_log_perron(tilt, np.zeros(problem.n_states), RTOL, MAX_NEWTON_STEPS)
 
 
 def _kl_to(problem: Problem, at: Problem, tilted: np.ndarray) -> np.ndarray:

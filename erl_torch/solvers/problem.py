@@ -37,7 +37,7 @@ class Problem:
     @classmethod
     def of(cls, mdp: TabularMDP, beta: float, prior_policy: Any = None) -> Problem:
         """Restrict ``mdp``. Raises InputError for beta <= 0 or a prior that is 0 somewhere."""
-        checks.positive("beta", beta)
+        checks.temperature("beta", beta)
         prior = check_policy("prior_policy", prior_policy, mdp.n_states, mdp.n_actions)
         if not (prior > 0).all():
             s, a = np.argwhere(prior <= 0)[0]

@@ -57,6 +57,7 @@ def solve_soft_bellman(
     """The optimal entropy-regularised policy of ``mdp``, with two-sided bounds on theta*.
 
     Args:
+        mdp: the problem, on the states that its start leads to.
         beta: inverse temperature, 1/reward, > 0.
         prior_policy: [S, A], entries > 0; None is uniform.
         tol: width of the bounds to stop at, relative to the range of the rewards.
@@ -93,14 +94,16 @@ def solve_problem(
     return exact_solution(mdp, problem, best.value, status, state.step, best.theta_bounds, prior_policy, message)
 
 
-def certify(solution: Solution, mdp: TabularMDP, beta: float, prior_policy: Any = None) -> Solution:
+def certify(
+    solution: Solution, mdp: TabularMDP, beta: float, prior_policy: Any = None, best: Solution | None = None
+) -> Solution:
     """``solution``, learnt by whatever means, with the ``theta_bounds`` of ``mdp`` and its policy's own ``gap``.
 
-    Solves the model: the bounds are those of ``solve_soft_bellman``, the gap is their lower end on g* less J(policy),
-    so an upper bound that is as sharp as they are narrow.
+    Solves the model, unless ``best`` is its ``solve_soft_bellman`` already: the bounds are those, the gap is their
+    lower end on g* less J(policy), so an upper bound that is as sharp as they are narrow.
     """
     problem = Problem.of(mdp, beta, prior_policy)
-    bounds = solve_soft_bellman(mdp, beta, prior_policy).theta_bounds
+    bounds = (best or solve_soft_bellman(mdp, beta, prior_policy)).theta_bounds
     assert bounds is not None
     policy = solution.policy.detach().cpu().numpy()[problem.states]
     return replace(solution, theta_bounds=bounds, gap=policy_gap(problem, policy, bounds), beta=beta)

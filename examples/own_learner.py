@@ -1,0 +1,59 @@
+"""A learner of your own: with five methods, the loops, replicas and certificates work. This is soft value iteration."""
+
+from dataclasses import dataclass
+
+import torch
+
+import erl_torch
+from erl_torch.envs.windy_cliff import WindyCliffEnv
+from erl_torch.learners.fitting import epochs, run_to_end
+
+
+@dataclass(frozen=True)
+class SweepState:
+    epoch: int
+    n_tuples: int
+    theta: float  # reward a step
+    value: torch.Tensor  # [S]
+    q: torch.Tensor  # [S, A], r + E V
+
+    def metrics(self):
+        return {"theta": self.theta, "epoch": self.epoch, "n_tuples": self.n_tuples}
+
+
+@dataclass(frozen=True)
+class SoftValueIteration:
+    beta: float = 10.0
+    n_epochs: int = 400
+    prior_policy: None = None  # uniform; Replicas asks for it
+    fit, iterate = run_to_end, epochs
+
+    def init(self, n_states, n_actions):
+        return SweepState(0, 0, 0.0, torch.zeros(n_states).double(), torch.zeros(n_states, n_actions).double())
+
+    def prepare(self, transitions, n_states, n_actions):
+        return erl_torch.empirical_mdp(transitions, n_states, n_actions)
+
+    def step(self, state, model):
+        q = torch.from_numpy(model.reward + (model.transition @ state.value.numpy()).reshape(model.reward.shape))
+        backed_up = (self.beta * q).exp().mean(1).log() / self.beta  # TV of docs/theory.md
+        theta = float(state.value[0] - backed_up[0])
+        value = (state.value + backed_up + theta) / 2  # lazy: no period can catch it
+        return SweepState(state.epoch + 1, int(model.visits.sum()), theta, value, q)
+
+    def finished(self, state):
+        return state.epoch == self.n_epochs
+
+    def solution(self, state, history=(), failure=None):
+        prior = torch.ones_like(state.q).softmax(1)
+        end = dict(n_steps=state.n_tuples, status=erl_torch.Status.COMPLETED)
+        return erl_torch.Solution.of_action_values(state.q, prior, self.beta, state.theta, **end)
+
+
+mdp = WindyCliffEnv().mdp
+tuples = erl_torch.collect(mdp, n_episodes=200, episode_length=1000, seed=0)
+learnt = SoftValueIteration().fit(tuples, 15, 4)
+print(f"{len(tuples):,} tuples, 400 sweeps over their counts:\ntheta {learnt.theta:.5f}")
+print(f"gap {erl_torch.certify(learnt, mdp, 10.0).gap:.1e}")
+sweep = erl_torch.Replicas.of(SoftValueIteration(), beta=[2.0, 5.0, 10.0]).fit(tuples, 15, 4)
+print("three temperatures at once:", [f"{theta:.4f}" for theta in sweep.theta])

@@ -1,0 +1,245 @@
+"""What TensorBoard shows: every tag documented, lines and boards, and its own API over real runs."""
+
+import contextlib
+import json
+import re
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import urllib.request
+from pathlib import Path
+
+import numpy as np
+import pytest
+from omegaconf import OmegaConf
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.plugins.hparams import plugin_data_pb2
+from test_config import composed
+
+from erl_torch import NonFiniteError, board, solve_soft_bellman
+from erl_torch.envs.windy_cliff import WindyCliffEnv
+from erl_torch.solvers import certify
+from erl_torch.training import train, where
+
+PAGE = (Path(__file__).parents[1] / "docs" / "logging.md").read_text()
+DOCUMENTED = set(re.findall(r"`([\w/]+)`", PAGE))
+SMALL = ("experience.n_episodes=20", "learner.n_epochs=2")
+
+
+def events(directory):
+    reader = EventAccumulator(str(directory), size_guidance={"images": 0, "scalars": 0, "tensors": 0})
+    return reader.Reload()
+
+
+def undocumented(directory):
+    """Tags of the run in ``directory`` that docs/logging.md does not have."""
+    found = set()
+    tags = events(directory).Tags()
+    texts = [tag.removesuffix("/text_summary") for tag in tags["tensors"] if tag.endswith("/text_summary")]
+    for tag in [*tags["scalars"], *tags["images"], *texts]:
+        name = re.sub(r"^(bands|sweep)/.*", r"\1/NAME", tag)
+        if name not in DOCUMENTED and not re.match(r"(s1|learner|exact|eval|optimal|prior|data|Final|time)/", tag):
+            name = re.sub(r"^[^/]+/(.*?)_(mean|median|q25|q75|min|max|optimal|prior)$", r"GROUP/\1", tag)
+        if name not in DOCUMENTED:
+            found.add(tag)
+    return found
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """A directory with a run of every kind, and what train returned of each."""
+    root = tmp_path_factory.mktemp("runs")
+    hydra = root / "s1" / ".hydra"
+    hydra.mkdir(parents=True)
+    (hydra / "overrides.yaml").write_text("- env=windy_cliff\n- ++vary.beta=[1, 2]\n")
+    kinds = {
+        "s1": SMALL,
+        "efficient": ("learner=s1_efficient", "experience.n_episodes=20", "evaluation.pictures=false"),
+        "soft_q": ("learner=soft_q", *SMALL, "evaluation.pictures=false"),
+        "exact": ("learner=exact", "evaluation.pictures=false"),
+        "replicas": (*SMALL, "n_replicas=3"),
+    }
+    return root, {name: train(composed(*overrides), root / name) for name, overrides in kinds.items()}
+
+
+def test_no_tag_is_undocumented(runs):
+    root, kinds = runs
+    assert {name: undocumented(root / name) for name in kinds} == {name: set() for name in kinds}
+
+
+@pytest.mark.parametrize("name", ["s1", "efficient", "soft_q"])
+def test_lines_stand_beside_every_record(runs, name):
+    """The cliff's closed figures: theta* = 1.0101363366 at beta 10, and the prior's reward a step."""
+    root, kinds = runs
+    reader = events(root / name)
+    steps = [e.step for e in reader.Scalars("eval/objective")]
+    best = solve_soft_bellman(WindyCliffEnv().mdp, 10.0)
+    for tag, value in [
+        ("optimal/theta", 1.0101363366),
+        ("optimal/theta_lower", best.theta_bounds[0]),
+        ("optimal/theta_upper", best.theta_bounds[1]),
+        ("optimal/objective", -1.0101363366),
+        ("optimal/reward_per_step", -0.95593),
+        ("optimal/return", -955.93),
+        ("optimal/delta_max", best.reward_bias_max),
+        ("optimal/rho", best.rho),
+        ("prior/reward_per_step", -1.6263453),
+        ("prior/return", reader.Scalars("eval/return")[0].value),
+    ]:
+        found = reader.Scalars(tag)
+        assert [e.step for e in found] == steps
+        assert [e.value for e in found] == pytest.approx([value] * len(steps), rel=1e-5)
+    for final in ("theta", "objective", "return", "reward_per_step", "gap"):
+        if kinds[name][final] is not None:
+            (event,) = reader.Scalars(f"Final/{final}")
+            assert (event.step, event.value) == (steps[-1], pytest.approx(kinds[name][final], rel=1e-6, abs=1e-12))
+
+
+def test_lines_of_the_exact_learner(runs):
+    reader = events(runs[0] / "exact")
+    last = reader.Scalars("eval/objective")[-1]
+    found = reader.Scalars("optimal/objective")
+    assert [e.step for e in found] == [0, last.step]
+    assert [e.value for e in found] == pytest.approx([last.value] * 2, rel=1e-6)
+
+
+def test_certificate_of_a_known_optimum():
+    mdp = WindyCliffEnv().mdp
+    best, other = solve_soft_bellman(mdp, 10.0), solve_soft_bellman(mdp, 5.0)
+    one, two = certify(other, mdp, 10.0), certify(other, mdp, 10.0, best=best)
+    assert (one.gap, one.theta_bounds) == (two.gap, two.theta_bounds)
+
+
+def test_charts_are_those_that_have_data():
+    known = {"data/theta", "data/theta_lower", "data/theta_upper"}
+    charts = board.layout(["s1/theta", "eval/objective"], known)
+    assert [list(charts[title]) for title in (board.CONVERGENCE, board.BIAS, board.RETURNS)] == [
+        ["theta; theta* of the model, ends of the data's 95%", "s1/theta in its bands: proven, data's 95%"],
+        [],
+        ["objective; optimal, prior"],
+    ]
+    assert charts[board.CONVERGENCE]["s1/theta in its bands: proven, data's 95%"] == [
+        ("s1/theta",) * 3,
+        ("data/theta", "data/theta_lower", "data/theta_upper"),
+    ]
+    assert len(board.layout(["s1/theta"], [])[board.CONVERGENCE]) == 1  # no band is known
+
+
+def test_jobs_of_a_sweep_are_shown_side_by_side():
+    assert where(Path("runs/windy_cliff/sweep-1/000-seed=0"))[1] == Path("runs/windy_cliff/sweep-1")
+    assert where(Path("runs/windy_cliff/1"))[1] == "runs"
+
+
+def test_hyperparameters_are_numbers_and_text():
+    found = board.hyperparameters(composed("env=frozen_lake"), n_replicas=3, vary=[1, 2])
+    assert found["learner"] == "s1"
+    assert found["clip_rho"] == "true"
+    assert found["n_replicas"] == 3
+    assert found["vary"] == "[1, 2]"
+    assert board.hyperparameters(composed("env=windy_frozen_lake", "env.desc=[SFG]"))["env.desc"] == '["SFG"]'
+    assert found["env.on_end"] == "restart"
+    assert not {"lr_rho", "env.suggest", "env.id", "name"} & set(found)  # lr_rho: null
+
+
+def test_texts(runs):
+    reader = events(runs[0] / "s1")
+    configuration, command = (
+        reader.Tensors(f"{tag}/text_summary")[0].tensor_proto.string_val[0].decode()
+        for tag in ("configuration", "command")
+    )
+    written = OmegaConf.create(configuration.removeprefix("```yaml\n").removesuffix("```"))
+    assert written.learner.beta == 10  # resolved
+    assert command == "```\npython train.py env=windy_cliff '++vary.beta=[1, 2]'\n```"
+    assert "command/text_summary" not in events(runs[0] / "exact").summary_metadata
+
+
+def test_failed_runs_are_marked(tmp_path):
+    with pytest.raises(NonFiniteError):
+        train(composed(*SMALL, "learner.beta=300", "learner.lr_u=0.9", "evaluation.pictures=false"), tmp_path)
+    plugin = events(tmp_path).summary_metadata["_hparams_/session_end_info"].plugin_data
+    assert plugin_data_pb2.HParamsPluginData.FromString(plugin.content).session_end_info.status == 2  # failure
+
+
+# -- TensorBoard's own API -----------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def tensorboard(logdir, n_runs):
+    """Asks the API of a TensorBoard on loopback that has read ``n_runs`` runs."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+
+    def ask(path, body=None):
+        data = None if body is None else json.dumps(body).encode()
+        request = urllib.request.Request(
+            f"http://127.0.0.1:{port}/data/{path}", data, {"Content-Type": "application/json"}
+        )
+        with urllib.request.urlopen(request, timeout=20) as answer:
+            return json.load(answer)
+
+    arguments = ["--logdir", str(logdir), "--host", "127.0.0.1", "--port", str(port), "--load_fast", "false"]
+    with tempfile.TemporaryFile() as log:
+        process = subprocess.Popen(
+            [sys.executable, "-W", "ignore", "-m", "tensorboard.main", *arguments], stdout=log, stderr=log
+        )
+        try:
+            deadline = time.monotonic() + 60
+            while True:
+                with contextlib.suppress(OSError):
+                    if len(ask("runs")) == n_runs:
+                        break
+                assert process.poll() is None
+                assert time.monotonic() < deadline
+                time.sleep(0.1)
+            yield ask
+        finally:
+            process.terminate()
+            process.wait(20)
+
+
+def test_api_has_tags_boards_and_columns(runs):
+    root, kinds = runs
+    with tensorboard(root, len(kinds)) as ask:
+        tags = {run: set(found) for run, found in ask("plugin/scalars/tags").items()}
+        assert tags == {name: set(events(root / name).Tags()["scalars"]) for name in kinds}
+        last = ask("plugin/scalars/scalars?run=s1&tag=s1/theta")[-1]
+        assert last[1:] == [kinds["s1"]["n_tuples"], pytest.approx(kinds["s1"]["theta"], rel=1e-6)]
+
+        boards = {category["title"]: category["chart"] for category in ask("plugin/custom_scalars/layout")["category"]}
+        assert list(boards) == [board.CONVERGENCE, board.BIAS, board.RETURNS]
+        titles = {chart["title"] for charts in boards.values() for chart in charts}
+        assert {title for charts in board.LINES.values() for title in charts} <= titles
+        written = set().union(*tags.values())
+        for chart in (chart for charts in boards.values() for chart in charts):
+            for band in chart.get("margin", {}).get("series", []):
+                assert set(band.values()) <= written
+            for pattern in chart.get("multiline", {}).get("tag", []):
+                assert any(re.match(pattern, tag) for tag in written), pattern
+
+        found = ask("plugin/hparams/experiment", {"includeMetrics": True})
+        columns = {column["name"] for column in found["hparamInfos"]}
+        union = set().union(*(board.hyperparameters(composed(*o)) for o in ((), ("learner=s1_efficient",))))
+        assert union | {"discount", "method", "n_replicas", "n_experience"} <= columns
+        metrics = [metric["name"]["tag"] for metric in found["metricInfos"]]
+        first = ["Final/gap", "Final/objective", "Final/return", "Final/reward_per_step", "Final/theta"]
+        assert metrics[:5] == first  # those that its table shows at first
+        rows = ask(
+            "plugin/hparams/session_groups",
+            {
+                "startIndex": 0, "sliceSize": 100, "allowedStatuses": ["STATUS_SUCCESS"],
+                "colParams": [{"metric": {"tag": tag}} for tag in first] + [{"hparam": "learner"}],
+            },
+        )["sessionGroups"]  # fmt: skip
+        assert {row["sessions"][0]["name"]: row["hparams"]["learner"] for row in rows} == {
+            "s1": "s1", "efficient": "s1_efficient", "soft_q": "soft_q", "exact": "exact", "replicas": "s1",
+        }  # fmt: skip
+        objective = {
+            row["sessions"][0]["name"]: value["value"]
+            for row in rows
+            for value in row["metricValues"]
+            if value["name"]["tag"] == "Final/objective"
+        }
+        np.testing.assert_allclose([objective[n] for n in kinds], [kinds[n]["objective"] for n in kinds], rtol=1e-6)

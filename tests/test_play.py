@@ -1,0 +1,215 @@
+"""Learnt policies in their environments: figures, text and pictures, and what is refused."""
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+from PIL import Image
+from test_config import CONF, composed
+
+from erl_torch import InputError, Solution, TabularMDP, cli
+from erl_torch.evaluation import reward_per_step
+from erl_torch.learners.replicas import ReplicaSolution
+from erl_torch.playing import find_run, play
+from erl_torch.training import make_env, train
+
+ROOT = Path(__file__).parents[1]
+
+
+def arguments(*overrides):
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return compose("play", list(overrides))
+
+
+def copy(template, run, policy, *overrides):
+    """A run directory like ``template``, with a policy and settings of our own."""
+    run.mkdir()
+    arrays = Solution.load(template / "solution.npz").arrays(history=False)
+    np.savez(run / "solution.npz", **arrays | {"policy": policy})
+    (run / ".hydra").mkdir()
+    OmegaConf.save(composed(*overrides), run / ".hydra" / "config.yaml")
+    return run
+
+
+@pytest.fixture(scope="module")
+def cliff(tmp_path_factory):
+    """A run on the windy cliff, solved exactly."""
+    run = tmp_path_factory.mktemp("cliff") / "run"
+    cfg = composed("learner=exact", "evaluation.pictures=false", "evaluation.horizon=200")
+    train(cfg, run)
+    (run / ".hydra").mkdir()
+    OmegaConf.save(cfg, run / ".hydra" / "config.yaml")
+    return run
+
+
+def test_returns_are_those_of_the_model(cliff, capsys):
+    played = play(arguments(f"run={cliff}", "n_episodes=200", "render=none"))
+    mdp = make_env(composed().env).unwrapped.mdp
+    expected = 200 * reward_per_step(mdp, Solution.load(cliff / "solution.npz").policy.numpy(), 200)
+    error = played.returns.std() / np.sqrt(200)
+    assert abs(played.returns.mean() - expected) < 4.5 * error
+    assert (played.lengths == 200).all()
+    assert not played.ended.any()
+    out = capsys.readouterr().out
+    assert out.startswith(f"windy_cliff, exact, seed 0 ({cliff})\n")
+    assert f"{played.returns.mean():.6g}" in out
+    assert "200, of which the environment ended 0" in out
+
+
+def test_episodes_have_their_own_streams(cliff):
+    few, many = (play(arguments(f"run={cliff}", f"n_episodes={n}", "render=none")) for n in (3, 6))
+    np.testing.assert_array_equal(few.returns, many.returns[:3])
+    other = play(arguments(f"run={cliff}", "n_episodes=3", "render=none", "seed=1"))
+    assert (few.returns != other.returns).any()
+
+
+def test_text_shows_the_first_steps(cliff, capsys):
+    played = play(arguments(f"run={cliff}", "n_episodes=1", "n_steps=3"))
+    assert len(played.shown) == 4
+    assert played.shown[0] == " H  G  R \n H  F  F \n H  F  F \n H  F  F \n H [S] R \n"
+    out = capsys.readouterr().out
+    assert "the first 3 steps" in out
+    assert out.endswith("\n".join(played.shown) + "\n")
+
+
+def test_gif(cliff, capsys):
+    played = play(arguments(f"run={cliff}", "n_episodes=1", "n_steps=5", "render=gif", "greedy=true"))
+    path = cliff / "episode-greedy-seed-0.gif"
+    assert str(path) in capsys.readouterr().out
+    with Image.open(path) as picture:
+        # Equal pictures in a row become one that stays longer.
+        assert 1 < picture.n_frames <= len(played.shown) == 6
+        assert picture.size == played.shown[0].shape[1::-1]
+        total = 0
+        for frame in range(picture.n_frames):
+            picture.seek(frame)
+            total += picture.info["duration"]
+        assert total == 6 * 250  # four steps a second
+
+
+def test_greedy_takes_the_most_probable_action(cliff, tmp_path):
+    """Three states in a row, two actions: stay or go on; the last returns. Rewards tell the state."""
+    stay, go = np.eye(3), np.roll(np.eye(3), 1, axis=1)
+    mdp = TabularMDP(np.stack([stay, go], 1), np.array([[0.0, 0], [1, 1], [2, 2]]), np.eye(3)[0])
+    path = mdp.save(tmp_path / "mdp.npz")
+    policy = np.array([[0.4, 0.6]] * 3)
+    run = copy(cliff, tmp_path / "run", policy, "env=mdp", f"env.path={path}", "evaluation.horizon=6")
+    played = play(arguments(f"run={run}", "greedy=true", "n_episodes=2", "n_steps=2"))
+    assert played.returns.tolist() == [6.0, 6.0]
+    assert played.shown == ["state 0\n", "state 1\n", "state 2\n"]
+    with pytest.raises(InputError, match="render=gif: must be ansi or none: mdp draws no pictures"):
+        play(arguments(f"run={run}", "render=gif"))
+
+
+@pytest.mark.parametrize(
+    ("env", "n_states", "n_actions", "render"),
+    [
+        ("frozen_lake", 16, 4, "ansi"),
+        ("cliff_walking", 48, 4, "gif"),
+        ("taxi", 500, 6, "ansi"),
+        ("windy_maze", 100, 4, "gif"),
+        ("pendulum", None, None, "gif"),
+        ("mountain_car", None, None, "ansi"),
+        ("cart_pole", None, None, "gif"),
+        ("acrobot", None, None, "none"),
+    ],
+)
+def test_environments(cliff, tmp_path, capsys, env, n_states, n_actions, render):
+    cfg = composed(f"env={env}")
+    if n_states is None:
+        spaces = make_env(cfg.env)
+        n_states, n_actions = spaces.observation_space.n, spaces.action_space.n
+    run = copy(cliff, tmp_path / "run", np.full((n_states, n_actions), 1 / n_actions), f"env={env}")
+    played = play(arguments(f"run={run}", "n_episodes=1", f"render={render}", "n_steps=2"))
+    if env == "mountain_car":
+        assert "mountain_car has no text to show; render=gif draws it" in capsys.readouterr().out
+    elif render != "none":
+        assert len(played.shown) == 3
+    assert len(list(run.glob("*.gif"))) == (render == "gif")
+    if env == "cart_pole":  # the original's reward: 1 for each step, the last included
+        assert played.returns.tolist() == played.lengths.tolist()
+        assert played.ended.all()
+
+
+def test_latest_and_replicas(cliff, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match="run=latest: must be a run directory: there is no run below runs/"):
+        find_run("latest")
+    shutil.copytree(cliff, "runs/windy_cliff/old")
+    run = Path("runs/windy_cliff/sweep/new")
+    cfg = composed("n_replicas=2", "experience.n_episodes=2", "learner.n_epochs=1", "learner.n_bias=1")
+    train(cfg, run)
+    (run / ".hydra").mkdir()
+    OmegaConf.save(cfg, run / ".hydra" / "config.yaml")
+    assert find_run("latest") == run
+    one = play(arguments("run=latest", "replica=1", "n_episodes=2", "render=none"))
+    policy = ReplicaSolution.load(run / "replicas.npz")[1].policy.numpy()
+    alone = copy(cliff, tmp_path / "alone", policy, "env=windy_cliff")
+    other = play(arguments(f"run={alone}", "n_episodes=2", "render=none"))
+    np.testing.assert_array_equal(one.returns, other.returns)
+    with pytest.raises(InputError, match=r"replica=2: must be a whole number in \[0, 2\)"):
+        play(arguments("run=latest", "replica=2"))
+
+
+def test_bad_runs_get_one_line(cliff, tmp_path):
+    def complaint(*overrides):
+        with pytest.raises(cli.BY_RUN) as caught:
+            play(arguments(*overrides))
+        line = cli._line(caught.value)
+        assert "\n" not in line
+        return line
+
+    good = f"run={cliff}"
+    assert (
+        complaint("run=nowhere")
+        == "run=nowhere: must be a run directory of train.py, with solution.npz or replicas.npz"
+    )
+    assert complaint(good, "replica=0").startswith("replica=0: must be left out")
+    assert complaint(good, "render=video") == "render=video: must be ansi or gif or none"
+    assert complaint(good, "n_episodes=0") == "n_episodes=0: must be a whole number >= 1"
+    assert complaint(good, "+steps=3").startswith("steps=3: must be left out: no such key; there are run, ")
+    for i, (text, expected) in enumerate(
+        [
+            (None, "No such file"),
+            ("env: [", "while parsing"),
+            ("- 3", "config.yaml ("),
+            ("seed: 0", "Missing key env"),
+            ("env: {name: x}\nlearner: {name: s1}\nevaluation: {horizon: 1}", "Missing key id"),
+        ]
+    ):
+        run = tmp_path / str(i)
+        shutil.copytree(cliff, run)
+        (run / ".hydra" / "config.yaml").unlink()
+        if text is not None:
+            (run / ".hydra" / "config.yaml").write_text(text)
+        line = complaint(f"run={run}")
+        assert line.startswith(f"run={run}: must be a run directory with the configuration")
+        assert expected in line
+    misfit = copy(cliff, tmp_path / "misfit", np.full((3, 2), 0.5), "env=windy_cliff")
+    assert "policy fits its environment (policy=array of shape (3, 2)" in complaint(f"run={misfit}")
+    (misfit / "solution.npz").write_bytes(b"PK junk")
+    assert "readable npz" in complaint(f"run={misfit}")
+
+
+def test_command_line(cliff, tmp_path):
+    for overrides, code, out, err in [
+        ((f"run={cliff}", "render=none", "n_episodes=2"), 0, "windy_cliff, exact, seed 0", ""),
+        (("run=nowhere",), 1, "", "error: run=nowhere: must be a run directory"),
+    ]:
+        done = subprocess.run(
+            [sys.executable, str(ROOT / "play.py"), *overrides],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            timeout=120,
+        )
+        assert done.returncode == code, done.stderr
+        assert done.stdout.startswith(out)
+        assert done.stderr.startswith(err)
+        assert done.stderr.count("\n") == code
+    assert not list(tmp_path.iterdir())  # nothing of its own is left
