@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from erl_torch.envs.estimate import EstimatedModel, estimate_mdp
     from erl_torch.envs.rollout import collect_rollouts, rollout
     from erl_torch.evaluation import Evaluation, evaluate
-    from erl_torch.experience import collect
+    from erl_torch.experience import collect, record
     from erl_torch.learners.algorithm_s1 import AlgorithmS1, S1State
     from erl_torch.learners.certainty_equivalence import CertaintyEquivalence
     from erl_torch.learners.efficient_s1 import EfficientS1
@@ -25,9 +25,10 @@ if TYPE_CHECKING:
     from erl_torch.learners.replicas import Replicas, ReplicaSolution, Simulation
     from erl_torch.mdp import TabularMDP
     from erl_torch.models import MeanRewardWarning, tabular_mdp
+    from erl_torch.recordings import FileRecording, open_recording, save_columns
     from erl_torch.solution import Solution, Status
     from erl_torch.solvers import certify, iterate_biasing, perron, solve_biasing, solve_soft_bellman
-    from erl_torch.transitions import Transitions
+    from erl_torch.transitions import Recording, Transitions
     from erl_torch.uncertainty import Estimate, bootstrap_theta, policy_uncertainty, theta_uncertainty
 
 __version__ = "0.1.0"
@@ -39,6 +40,8 @@ _HOME = {
     "EfficientS1": "learners.efficient_s1",
     "EmpiricalMDP": "empirical",
     "Estimate": "uncertainty",
+    "FileRecording": "recordings",
+    "Recording": "transitions",
     "Evaluation": "evaluation",
     "InputError": "checks",
     "MeanRewardWarning": "models",
@@ -59,6 +62,9 @@ _HOME = {
     "TabularMDP": "mdp",
     "Transitions": "transitions",
     "collect": "experience",
+    "open_recording": "recordings",
+    "record": "experience",
+    "save_columns": "recordings",
     "collect_rollouts": "envs.rollout",
     "estimate_mdp": "envs.estimate",
     "evaluate": "evaluation",
@@ -76,9 +82,11 @@ __all__ = [
     "Estimate",
     "EstimatedModel",
     "Evaluation",
+    "FileRecording",
     "InputError",
     "MeanRewardWarning",
     "NonFiniteError",
+    "Recording",
     "ReplicaSolution",
     "Replicas",
     "S1State",
@@ -95,9 +103,12 @@ __all__ = [
     "estimate_mdp",
     "evaluate",
     "iterate_biasing",
+    "open_recording",
     "perron",
     "policy_uncertainty",
+    "record",
     "rollout",
+    "save_columns",
     "solve_biasing",
     "solve_soft_bellman",
     "tabular_mdp",

@@ -15,7 +15,6 @@ import math
 import shutil
 import sys
 import time
-import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -27,7 +26,6 @@ import torch
 from erl_torch.checks import InputError
 from erl_torch.files import write_bytes, write_json
 from erl_torch.learners import states
-from erl_torch.transitions import Transitions
 
 FORMAT = 1
 KEPT = 2
@@ -108,14 +106,6 @@ class Checkpoints:
             more = f" and {len(differ) - 5} more" if len(differ) > 5 else ""
             allowed = f"of a run with these settings, or a new one: not {shown}{more}"
             raise InputError("hydra.run.dir", self.directory, allowed)
-
-
-def digest(data: Transitions) -> int:
-    """A checksum of all columns."""
-    found = 0
-    for field in fields(data):
-        found = zlib.crc32(memoryview(getattr(data, field.name)), found)
-    return found
 
 
 def columns(rows: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:

@@ -257,6 +257,9 @@ class Simulate:
 class Recorded:
     name: str = "recorded"
     path: str = MISSING
+    on_bad: str = "stop"
+    chunk: int = 4_194_304
+    on_prior: bool = False
 
 
 @dataclass

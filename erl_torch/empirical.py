@@ -26,7 +26,9 @@ from erl_torch.chains import classes
 from erl_torch.checks import InputError
 from erl_torch.mdp import check_policy
 from erl_torch.solvers.problem import Problem
-from erl_torch.transitions import Transitions
+from erl_torch.transitions import Recording
+
+BLOCK = 1 << 16  # tuples at a time: they stay in the processor's cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,40 +124,122 @@ class EmpiricalProblem:
     reducible: bool  # the stream shows several closed classes; this is the most visited
 
 
-def empirical_mdp(transitions: Transitions, n_states: int, n_actions: int) -> EmpiricalMDP:
-    """Counts and mean rewards of a stream.
+@dataclass(frozen=True, eq=False)
+class Tally:
+    """What one pass over a stream tells, in memory for S*A pairs and the distinct (s,a,s')."""
+
+    visits: np.ndarray  # [S*A] int64
+    indptr: np.ndarray  # [S*A + 1], rows of the (s,a,s') met
+    indices: np.ndarray  # [nnz] int32, s', ascending in a row
+    counts: np.ndarray  # [nnz] int64
+    reward_given_next: np.ndarray  # mean, [nnz]
+    last_reward: np.ndarray  # of the last visit, [S*A]; 0 without visits
+    varied: bool  # a pair has had two rewards
+    reward_range: tuple[float, float]
+    psi_weight: np.ndarray  # [nnz], W of one psi epoch; 0 without lr_psi
+
+    @property
+    def psi_map(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """W as CSR [S*A, S] without the visits that have underflowed; the decay is (1 - lr_psi)**visits."""
+        kept = self.psi_weight > 0
+        indptr = np.concatenate(([0], np.cumsum(kept)))[self.indptr]
+        return indptr, self.indices[kept], self.psi_weight[kept]
+
+
+def tally(data: Recording, n_states: int, n_actions: int, lr_psi: float = 0.0) -> Tally:
+    """Count a stream: to the same bits, however it is cut.
 
     Args:
-        transitions: the tuples; a' is not used.
+        data: the tuples; a' is not used.
         n_states, n_actions: sizes of the tables.
+        lr_psi: step size of lines 2-3 of Algorithm S1, for W; 0: there is none.
 
     Raises:
         InputError: naming the first tuple with a state or action out of range.
     """
-    transitions.check_range(n_states, n_actions)
+    data.check_range(n_states, n_actions)
     n_pairs = n_states * n_actions
     if n_pairs > np.iinfo(np.int32).max:
         raise InputError("n_states * n_actions", n_pairs, "below 2**31")
-    pair = transitions.s * np.int32(n_actions) + transitions.a
-    visits = kernels.visit_counts(pair, n_pairs)
-    shape = (n_pairs, n_states)
-    # Both share one pattern: sums of equal (row, column) are kept even where they are 0.
-    counts = sp.coo_array((np.ones(len(pair)), (pair, transitions.s_next)), shape=shape).tocsr()
-    rewards = sp.coo_array((transitions.r, (pair, transitions.s_next)), shape=shape).tocsr()
-    for table in (counts, rewards):
-        table.sum_duplicates()
+    pairs = np.tile([0.0, 0.0, 1.0, -1.0], (n_pairs, 1))
+    size, used = 512, 0
+    keys, entries = np.empty(size, np.int64), np.zeros((size, 4))
+    table, shift = _table(keys, 0, 2 * size)
+    varied, smallest, largest = False, np.inf, -np.inf
+    for chunk in data.chunks():
+        for begin in range(0, len(chunk), BLOCK):
+            block = slice(begin, begin + BLOCK)
+            pair, s_next, r = chunk.s[block] * np.int32(n_actions) + chunk.a[block], chunk.s_next[block], chunk.r[block]
+            done = 0
+            while done < len(pair):
+                if used == size:
+                    size *= 4
+                    keys, entries = np.resize(keys, size), np.concatenate((entries, np.zeros((size - used, 4))))
+                    table, shift = _table(keys, used, 2 * size)
+                done, used, changed, low, high = kernels.tally(
+                    pair, s_next, r, n_states, lr_psi, shift, table, keys, entries, pairs, used, done
+                )
+                varied, smallest, largest = varied or changed, min(smallest, low), max(largest, high)
+    order = np.argsort(keys[:used])
+    row, indices = np.divmod(keys[:used][order], n_states)
+    counts, totals, weight, _ = entries[order].T
+    return Tally(
+        visits=pairs[:, 0].astype(np.int64),
+        indptr=np.concatenate(([0], np.cumsum(np.bincount(row, minlength=n_pairs)))),
+        indices=indices.astype(np.int32),
+        counts=counts.astype(np.int64),
+        reward_given_next=totals / counts,
+        last_reward=pairs[:, 1].copy(),
+        varied=varied,
+        reward_range=(float(smallest), float(largest)),
+        psi_weight=weight * pairs[row, 2],
+    )
+
+
+def _table(keys: np.ndarray, used: int, size: int) -> tuple[np.ndarray, int]:
+    """(hash table [size, 2] of the entries, shift), for ``kernels.tally``; size a power of two."""
+    table = np.full((size, 2), -1, np.int64)
+    shift = 65 - size.bit_length()
+    kernels.enter(table, keys, used, shift)
+    return table, shift
+
+
+def empirical_mdp(data: Recording, n_states: int, n_actions: int, found: Tally | None = None) -> EmpiricalMDP:
+    """Counts and mean rewards of a stream: one pass over it, and two more where rewards vary.
+
+    Args:
+        data: the tuples; a' is not used.
+        n_states, n_actions: sizes of the tables.
+        found: the tally of the stream, where there is one already.
+
+    Raises:
+        InputError: naming the first tuple with a state or action out of range.
+    """
+    found = found or tally(data, n_states, n_actions)
+    visits, base = found.visits, found.last_reward
     n = np.maximum(visits, 1)
-    # Around the first reward of each pair, so that a constant reward has exactly itself as mean.
-    base = np.zeros(n_pairs)
-    base[pair] = transitions.r
-    reward = base + np.bincount(pair, transitions.r - base[pair], n_pairs) / n
-    squares = np.bincount(pair, (transitions.r - reward[pair]) ** 2, n_pairs)
+    # Around one reward of each pair, so that a constant reward has exactly itself as mean.
+    off, squares = np.zeros(len(visits)), np.zeros(len(visits))
+    reward = base + off
+    if found.varied:
+        with np.errstate(over="ignore", invalid="ignore"):
+            for chunk in data.chunks():
+                pair = chunk.s * np.int32(n_actions) + chunk.a
+                np.add.at(off, pair, chunk.r - base[pair])
+            reward = base + off / n
+            for chunk in data.chunks():
+                pair = chunk.s * np.int32(n_actions) + chunk.a
+                np.add.at(squares, pair, (chunk.r - reward[pair]) ** 2)
+        if not np.isfinite(squares).all():
+            low, high = found.reward_range
+            raise InputError("r", f"between {low:g} and {high:g}", "of a size whose squares are finite numbers")
+    rows = np.diff(found.indptr)
     return EmpiricalMDP(
         visits=visits.reshape(n_states, n_actions),
         transition=sp.csr_array(
-            (counts.data / np.repeat(n, np.diff(counts.indptr)), counts.indices, counts.indptr), shape
+            (found.counts / np.repeat(n, rows), found.indices, found.indptr), shape=(len(visits), n_states)
         ),
         reward=reward.reshape(n_states, n_actions),
         reward_variance=(squares / np.maximum(visits - 1, 1)).reshape(n_states, n_actions),
-        reward_given_next=rewards.data / counts.data,
+        reward_given_next=found.reward_given_next,
     )

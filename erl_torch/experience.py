@@ -16,7 +16,9 @@ real transitions enter the stream.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -27,9 +29,10 @@ from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.mdp import TabularMDP, check_policy
 from erl_torch.models import changed_by, known_mdp, sizes
+from erl_torch.recordings import ColumnWriter, save_columns
 from erl_torch.rng import Streams, streams
 from erl_torch.sampling import Sampler
-from erl_torch.transitions import Transitions
+from erl_torch.transitions import Transitions, join
 
 BLOCK = 1_000_000  # steps a compiled call, so that signals and progress bars are served
 
@@ -70,15 +73,76 @@ def collect(
     mdp = known_mdp(source)
     if mdp is not None:
         return _simulate(mdp, n_episodes, episode_length, rng, behaviour, prior, on_prior, report)
-    if isinstance(source, gym.vector.VectorEnv):
-        return _step_vector(source, n_episodes * episode_length, rng, behaviour, prior, on_prior, report)
-    assert not isinstance(source, TabularMDP)
-    batch = batched(source)
+    batch = None if isinstance(source, (TabularMDP, gym.vector.VectorEnv)) else batched(source)
     if batch is not None:
         return batch(
             n_episodes, episode_length, seed=rng, behaviour_policy=None if on_prior else behaviour, prior_policy=prior
         )
+    assert not isinstance(source, TabularMDP)
+    return join(list(_played(source, n_episodes, episode_length, rng, behaviour, prior, on_prior, report)))
+
+
+def _played(
+    source: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any],
+    n_episodes: int,
+    episode_length: int,
+    rng: Streams,
+    behaviour: np.ndarray,
+    prior: np.ndarray,
+    on_prior: bool,
+    report: Report,
+) -> Iterator[Transitions]:
+    """The tuples of an environment that is stepped, some thousands at a time."""
+    if isinstance(source, gym.vector.VectorEnv):
+        return _step_vector(source, n_episodes * episode_length, rng, behaviour, prior, on_prior, report)
     return _step_through(source, n_episodes, episode_length, rng, behaviour, prior, on_prior, report)
+
+
+def record(
+    source: TabularMDP | gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any],
+    directory: str | os.PathLike[str],
+    n_episodes: int,
+    episode_length: int,
+    seed: int | Streams = 0,
+    behaviour_policy: Any = None,
+    prior_policy: Any = None,
+    report: Report | None = None,
+) -> Path:
+    """Write what ``collect`` gives to a directory of columns (``erl_torch.open_recording`` reads it).
+
+    In memory of some tuples, whatever the length, but for this package's control tasks, whose episodes are played in
+    batches.
+
+    Raises:
+        InputError: as ``collect``; a directory that holds anything else.
+    """
+    mdp = known_mdp(source)
+    if mdp is None and not isinstance(source, (TabularMDP, gym.vector.VectorEnv)) and batched(source):
+        data = collect(source, n_episodes, episode_length, seed, behaviour_policy, prior_policy, report)
+        return save_columns(data, directory)
+    checks.at_least("n_episodes", n_episodes, 1)
+    checks.at_least("episode_length", episode_length, 1)
+    n_states, n_actions = sizes(source)
+    prior = check_policy("prior_policy", prior_policy, n_states, n_actions)
+    on_prior = behaviour_policy is None
+    behaviour = prior if on_prior else check_policy("behaviour_policy", behaviour_policy, n_states, n_actions)
+    rng = seed if isinstance(seed, Streams) else streams(seed)
+    chunks: Iterator[Transitions]
+    if mdp is not None:
+        reward = mdp.reward
+        blocks = _blocks(mdp, n_episodes * episode_length, episode_length, rng, behaviour, prior, on_prior)
+        chunks = (of_pairs(*block, reward) for block in blocks)
+    else:
+        assert not isinstance(source, TabularMDP)
+        chunks = _played(source, n_episodes, episode_length, rng, behaviour, prior, on_prior, lambda _: None)
+    done = 0
+    with ColumnWriter(directory) as writer:
+        for chunk in chunks:
+            writer.append(chunk)
+            done += len(chunk)
+            if report is not None:
+                report(done)
+    return writer.directory
 
 
 def batched(env: gym.Env[Any, Any]) -> Callable[..., Transitions] | None:
@@ -107,14 +171,29 @@ def _simulate(
 ) -> Transitions:
     n = n_episodes * episode_length
     pair, pair_next = np.empty(n, np.int32), np.empty(n, np.int32)
+    done = 0
+    for here, there in _blocks(mdp, n, episode_length, rng, behaviour, prior, on_prior):
+        pair[done : done + len(here)], pair_next[done : done + len(here)] = here, there
+        done += len(here)
+        report(done)
+    return of_pairs(pair, pair_next, mdp.reward)
+
+
+def _blocks(
+    mdp: TabularMDP,
+    n: int,
+    episode_length: int,
+    rng: Streams,
+    behaviour: np.ndarray,
+    prior: np.ndarray,
+    on_prior: bool,
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """``n`` tuples as (pair, pair_next), a block at a time."""
     sampler = Sampler(mdp, [rng], episode_length, behaviour, prior, on_prior)
     for begin in range(0, n, BLOCK):
-        part = slice(begin, min(n, begin + BLOCK))
-        here, _, there = sampler.take(part.stop - begin)
-        pair[part], pair_next[part] = here[:, 0], there[:, 0]
-        report(part.stop)
+        here, _, there = sampler.take(min(n, begin + BLOCK) - begin)
+        yield here[:, 0], there[:, 0]
     sampler.give_back()
-    return of_pairs(pair, pair_next, mdp.reward)
 
 
 def of_pairs(pair: np.ndarray, pair_next: np.ndarray, reward: np.ndarray) -> Transitions:
@@ -133,8 +212,9 @@ def _step_through(
     prior: np.ndarray,
     on_prior: bool,
     report: Report,
-) -> Transitions:
+) -> Iterator[Transitions]:
     rows: list[tuple[int, int, float, int, int]] = []
+    done = 0
     behaviour_cdf, prior_cdf = np.cumsum(behaviour, axis=1), np.cumsum(prior, axis=1)
 
     def draw(cdf: np.ndarray, s: int) -> int:
@@ -151,13 +231,21 @@ def _step_through(
             state_next = fresh if terminated and fresh is not None else int(observation)
             action_next = draw(prior_cdf, state_next)
             rows.append((state, action, float(reward), state_next, action_next))
-            if len(rows) % 10_000 == 0:
-                report(len(rows))
+            if len(rows) == 10_000:
+                done += len(rows)
+                report(done)
+                yield _of_rows(rows)
+                rows = []
             state = state_next if fresh is None else fresh
             if over:
                 break
             action = action_next if on_prior else draw(behaviour_cdf, state)
-    report(len(rows))
+    report(done + len(rows))
+    if rows:
+        yield _of_rows(rows)
+
+
+def _of_rows(rows: list[tuple[int, int, float, int, int]]) -> Transitions:
     return Transitions(*(np.array(column) for column in zip(*rows, strict=True)))
 
 
@@ -169,7 +257,7 @@ def _step_vector(
     prior: np.ndarray,
     on_prior: bool,
     report: Report,
-) -> Transitions:
+) -> Iterator[Transitions]:
     """The first ``n`` tuples, step by step and within a step by environment."""
     mode = env.metadata.get("autoreset_mode")
     if not isinstance(mode, AutoresetMode):
@@ -186,7 +274,7 @@ def _step_vector(
     restarting = np.zeros(env.num_envs, bool)  # this step is a reset: its observation a first state
     unfinished = restarting.copy()  # terminated the step before: s' is that first state
     columns: list[tuple[np.ndarray, ...]] = []
-    collected = 0
+    collected = given = 0
     while collected < n:
         observation, stepped_reward, terminated, truncated, info = env.step(action)
         after = np.array(observation)
@@ -207,6 +295,10 @@ def _step_vector(
         columns.append(tuple(column[ready] for column in (state, action, reward, after, action_next)))
         collected += int(ready.sum())
         report(min(collected, n))
+        if collected >= n or collected - given >= 10_000:
+            part = Transitions(*(np.concatenate(column) for column in zip(*columns, strict=True)))
+            yield part.first(min(collected, n) - given)
+            columns, given = [], collected
         goes_on = ~over & ~restarting
         unfinished = terminated & ~known
         held_state, held_action = state, action
@@ -214,7 +306,6 @@ def _step_vector(
         action = np.where(goes_on & on_prior, action_next, draw(behaviour_cdf, state))
         restarting = over & ~known
         state, action = np.where(restarting, held_state, state), np.where(restarting, held_action, action)
-    return Transitions(*(np.concatenate(column)[:n] for column in zip(*columns, strict=True)))
 
 
 def _seed(rng: Streams) -> int:

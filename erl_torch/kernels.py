@@ -29,75 +29,77 @@ def compiled_before() -> bool:
 
 
 @numba.njit(cache=True, error_model="numpy", nogil=True)
-def visit_counts(pair, n_pairs):
-    """Visits of every pair. pair [N] int32 -> [n_pairs] int64."""
-    counts = np.zeros(n_pairs, np.int64)
-    for t in range(pair.size):
-        counts[pair[t]] += 1
-    return counts
+def _slot(table, key, shift):
+    """Row of the table that holds ``key``, or the free one (entry -1) that is to hold it."""
+    last = len(table) - 1
+    slot = np.int64((np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(shift))
+    while table[slot, 1] >= 0 and table[slot, 0] != key:
+        slot = (slot + 1) & last
+    return slot
 
 
 @numba.njit(cache=True, error_model="numpy", nogil=True)
-def _forget(weight, scale, keep, first, last):
-    """One visit of a pair: what its row, scale * weight[first:last], holds is multiplied by ``keep``.
-
-    Returns the new scale; the weights change only once it leaves the range where nothing is lost.
-    """
-    scale *= keep
-    if scale < 1e-200:
-        for m in range(first, last):
-            weight[m] *= scale
-        scale = 1.0
-    return scale
+def enter(table, keys, used, shift):
+    """Fill a free table with the first ``used`` entries."""
+    for e in range(used):
+        slot = _slot(table, keys[e], shift)
+        table[slot, 0] = keys[e]
+        table[slot, 1] = e
 
 
 @numba.njit(cache=True, error_model="numpy", nogil=True)
-def psi_map(pair, s_next, counts, n_states, lr_psi):
-    """W of one psi epoch as CSR [n_pairs, n_states]; the decay is (1 - lr_psi)**counts.
+def tally(pair, s_next, r, n_states, lr_psi, shift, table, keys, entries, pairs, used, begin):
+    """Tuples from ``begin`` on, counted into rows, so that a tuple touches few cache lines:
 
-    The i-th visit from the end of a pair enters with weight lr_psi * (1 - lr_psi)**i.
+        pairs [n_pairs, 4]   visits, last reward, factor of the weights below, newest entry of the pair
+        entries [n, 4]       of a (pair, s') met: tuples, sum of rewards, weight, next older entry of the pair
+
+    With ``lr_psi`` > 0, factor * weight is W of one psi epoch: the i-th visit of a pair from its end enters with
+    lr_psi * (1 - lr_psi)**i. ``table`` [2**(64 - shift), 2] holds key = pair * n_states + s' and entry; ``keys`` [n]
+    the keys by entry. All change in place.
+
+    Returns (t, used, varied, smallest r, largest r): t < N where the entries, all ``used``, do not suffice; varied
+    where a reward is not the one of the pair's visit before.
     """
-    n_pairs = counts.size
-    # A stable counting sort brings the visits of a pair together, in order: one pass over the stream.
-    end = np.cumsum(counts)
-    fill = end - counts
-    visits = np.empty(pair.size, np.int32)
-    for t in range(pair.size):
-        k = pair[t]
-        visits[fill[k]] = s_next[t]
-        fill[k] += 1
-
-    indptr = np.zeros(n_pairs + 1, np.int64)
-    indices = np.empty(max(1, min(pair.size, n_pairs * n_states)), np.int32)
-    data = np.empty(indices.size, np.float64)
-    place = np.full(n_states, -1, np.int64)  # of a state in the row
-    row = np.empty(n_states, np.float64)
-    n = 0
-    for k in range(n_pairs):
-        used = 0
-        scale = 1.0
-        for v in range(end[k] - counts[k], end[k]):
-            s = visits[v]
-            if place[s] < 0:
-                place[s] = used
-                row[used] = 0.0
-                indices[n + used] = s
-                used += 1
-            scale = _forget(row, scale, 1.0 - lr_psi, 0, used)
-            row[place[s]] += lr_psi / scale
-        indices[n : n + used].sort()
-        kept = n
-        for m in range(n, n + used):
-            s = indices[m]
-            weight = row[place[s]] * scale
-            place[s] = -1
-            if weight > 0.0:  # older visits underflow
-                indices[kept] = s
-                data[kept] = weight
-                kept += 1
-        n = kept
-        indptr[k + 1] = n
-    return indptr, indices[:n].copy(), data[:n].copy()
+    varied = False
+    smallest = np.inf
+    largest = -np.inf
+    for t in range(begin, pair.size):
+        k = np.int64(pair[t])
+        key = k * n_states + s_next[t]
+        slot = _slot(table, key, shift)
+        e = table[slot, 1]
+        if e < 0:
+            if used == keys.size:
+                return t, used, varied, smallest, largest
+            e = used
+            used += 1
+            table[slot, 0] = key
+            table[slot, 1] = e
+            keys[e] = key
+            entries[e, 3] = pairs[k, 3]
+            pairs[k, 3] = e
+        entries[e, 0] += 1.0
+        entries[e, 1] += r[t]
+        if pairs[k, 0] > 0.0 and pairs[k, 1] != r[t]:
+            varied = True
+        pairs[k, 0] += 1.0
+        pairs[k, 1] = r[t]
+        smallest = min(smallest, r[t])
+        largest = max(largest, r[t])
+        if lr_psi > 0.0:
+            # A visit multiplies the pair's whole row; the weights change only once the factor leaves the range where
+            # nothing is lost.
+            factor = pairs[k, 2] * (1.0 - lr_psi)
+            if factor < 1e-200:
+                m = np.int64(pairs[k, 3])
+                while m >= 0:
+                    entries[m, 2] *= factor
+                    m = np.int64(entries[m, 3])
+                factor = 1.0
+            pairs[k, 2] = factor
+            entries[e, 2] += lr_psi / factor
+    return pair.size, used, varied, smallest, largest
 
 
 @numba.njit(cache=True, error_model="numpy", nogil=True)
@@ -193,8 +195,12 @@ def _is_healthy(z, q):
 
 
 @numba.njit(cache=True, error_model="numpy", nogil=True)
-def u_epoch(pair, pair_next, factor, noisy, g, z, inv_rho, lr_u, lr_rho, inv_rho_min, new, rescale_every, begin, end):
-    """Lines 9-11 over tuples begin..end; z [n_pairs] changes in place.
+def u_epoch(
+    pair, pair_next, factor, noisy, g, z, inv_rho, lr_u, lr_rho, inv_rho_min, new, rescale_every, begin, end, first=0
+):
+    """Lines 9-11 over tuples begin..end of a pass; z [n_pairs] changes in place.
+
+    ``first``: tuple of the pass that stands first in the columns.
 
     Every ``rescale_every`` tuples z is multiplied by a power of two that brings its mean to about 1: the
     updates are homogeneous in z, so this changes no bit of rho or of the policy.
@@ -208,15 +214,15 @@ def u_epoch(pair, pair_next, factor, noisy, g, z, inv_rho, lr_u, lr_rho, inv_rho
         stop = min(end, t - t % rescale_every + rescale_every)
         backup[:] = z
         q_before = q
-        q = _u_chunk(pair, pair_next, factor, noisy, g, z, q, lr_u, lr_rho, inv_rho_min, new, t, stop)
+        q = _u_chunk(pair, pair_next, factor, noisy, g, z, q, lr_u, lr_rho, inv_rho_min, new, t - first, stop - first)
         if not _is_healthy(z, q):
             z[:] = backup
             q = q_before
-            for bad in range(t, stop):
+            for bad in range(t - first, stop - first):
                 q = _u_chunk(pair, pair_next, factor, noisy, g, z, q, lr_u, lr_rho, inv_rho_min, new, bad, bad + 1)
                 k = pair[bad]
                 if not (np.isfinite(q) and q > 0.0 and np.isfinite(z[k]) and z[k] > 0.0):
-                    return q, bad
+                    return q, bad + first
             return q, stop - 1
         t = stop
         if t % rescale_every == 0:
@@ -349,9 +355,10 @@ def shared_epoch(
 @numba.njit(cache=True, error_model="numpy", nogil=True)
 def gauge_epoch(
     pair, after, factor, noisy, g, z, total, average, weight, n_actions, steps, visits, rho, lr_rho, rho_max,
-    expected, rescale_every, begin, end,
+    expected, rescale_every, begin, end, first=0,
 ):  # fmt: skip
-    """Lines 9-11 over tuples begin..end; z, total and visits [n_pairs] change in place.
+    """Lines 9-11 over tuples begin..end of a pass, of which ``first`` stands first in the columns; z, total and visits
+    [n_pairs] change in place.
 
     ``after`` [N] is s' where ``expected`` (backup y(s') = sum_a weight z) or s' * A + a'. The step of a pair's n-th
     visit is ``steps[min(n, last)]``. With ``average``, total sums z over the visits. Every ``rescale_every`` tuples a
@@ -369,7 +376,7 @@ def gauge_epoch(
             y[s] = 0.0
             for k in range(s * n_actions, (s + 1) * n_actions):
                 y[s] += weight[k] * z[k]
-        for i in range(t, stop):
+        for i in range(t - first, stop - first):
             k = pair[i]
             gain = g[k]
             if noisy:
@@ -428,7 +435,7 @@ def _log_row(log_z, log_weight, first, n_actions):
 @numba.njit(cache=True, error_model="numpy", nogil=True)
 def log_gauge_epoch(
     pair, after, log_factor, noisy, log_g, log_z, log_total, average, log_weight, n_actions, steps, visits, log_rho,
-    lr_rho, log_rho_max, expected, rescale_every, begin, end,
+    lr_rho, log_rho_max, expected, rescale_every, begin, end, first=0,
 ):  # fmt: skip
     """``gauge_epoch`` in logarithms: finite for finite input of any size. Returns (log rho, true)."""
     n_states = log_z.size // n_actions
@@ -439,7 +446,7 @@ def log_gauge_epoch(
         stop = min(end, t - t % rescale_every + rescale_every)
         for s in range(n_states):
             y[s] = _log_row(log_z, log_weight, s * n_actions, n_actions)
-        for i in range(t, stop):
+        for i in range(t - first, stop - first):
             k = pair[i]
             gain = log_g[k]
             if noisy:
@@ -676,8 +683,22 @@ def sampled_epoch(
 
 
 @numba.njit(cache=True, error_model="numpy", nogil=True)
+def _forget(weight, scale, keep, first, last):
+    """One visit of a pair: what its row, scale * weight[first:last], holds is multiplied by ``keep``.
+
+    Returns the new scale; the weights change only once it leaves the range where nothing is lost.
+    """
+    scale *= keep
+    if scale < 1e-200:
+        for m in range(first, last):
+            weight[m] *= scale
+        scale = 1.0
+    return scale
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
 def survey(indptr, pair, entry, keep_psi, lr_psi, visits, weight, scale):
-    """Visits and W (see ``psi_map``) of streams [n, lanes], on the rows of the model's CSR transition matrix.
+    """Visits and W (see ``tally``) of streams [n, lanes], on the rows of the model's CSR transition matrix.
 
     visits [lanes, n_pairs] counts on; W = scale [lanes, n_pairs] * weight [lanes, nnz].
     """

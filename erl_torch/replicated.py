@@ -27,13 +27,13 @@ from tqdm import tqdm
 
 from erl_torch import checks, pictures
 from erl_torch.board import Board, hyperparameters, replica_layout
-from erl_torch.checkpoint import Checkpoints, columns, digest, rows_of
+from erl_torch.checkpoint import Checkpoints, columns, rows_of
 from erl_torch.checks import InputError
 from erl_torch.evaluation import Judge, evaluate
 from erl_torch.experience import collect
 from erl_torch.files import read_npy, write_json, write_png
 from erl_torch.learners import Exact, NonFiniteError
-from erl_torch.learners.replicas import Experience, Replicas, ReplicaSolution, Simulation
+from erl_torch.learners.replicas import KEEP_BYTES, Experience, Replicas, ReplicaSolution, Simulation
 from erl_torch.mdp import TabularMDP
 from erl_torch.models import known_mdp, sizes
 from erl_torch.rng import streams
@@ -108,13 +108,13 @@ def train_replicas(cfg: DictConfig, directory: Path, safe_point: SafePoint, save
         replicas = Replicas(tuple(learners), threads)
         seeds = [cfg.seed + i for _ in groups for i in range(cfg.n_replicas)]
         prior = replicas.prior_policy(n_states, n_actions)
-        experience = _experience(cfg, world, seeds, n_states, n_actions, prior, safe_point)
+        experience = _experience(cfg, env, world, seeds, n_states, n_actions, prior, safe_point)
         n_experience = max(_lengths(experience))
         judge = _Judges(cfg, env, world, prior, [one.beta for one in learners], seeds, threads)
 
         exact = _exact(cfg, judge, groups)
         record = _Record(groups, exact)
-        stream = None if isinstance(experience, Simulation) else [digest(data) for data in _recorded(experience)]
+        stream = None if isinstance(experience, Simulation) else [data.checksum() for data in _recorded(experience)]
         found = saved.start()
         if found and found["digest"] != stream:
             raise InputError("experience", "another stream", "the one that the run in its directory began with")
@@ -268,6 +268,7 @@ def _with(learner: Any, settings: Mapping[str, float]) -> Any:
 
 def _experience(
     cfg: DictConfig,
+    env: gym.Env[Any, Any],
     world: World,
     seeds: list[int],
     n_states: int,
@@ -280,7 +281,11 @@ def _experience(
         said = "1: on one stream, replicas with the same settings would be the same (let settings vary, vary.KEY=[...])"
         raise InputError("n_replicas", cfg.n_replicas, said)
     if cfg.experience.name == "recorded":
-        return recorded(cfg.experience, n_states, n_actions)
+        found = recorded(cfg.experience, env, n_states, n_actions, cfg.seed, prior, safe_point)
+        if len(found) * 24 > KEEP_BYTES:
+            allowed = f"of at most {KEEP_BYTES // 24:,} tuples, as replicas hold them in memory: it has {len(found):,}"
+            raise InputError("experience.path", found.path, allowed)
+        return found.load()
     e = cfg.experience
     if e.save_to is not None and not shared:
         raise InputError("experience.save_to", e.save_to, "null: there is a stream a replica (or shared_stream=true)")

@@ -26,7 +26,7 @@ import erl_torch
 from erl_torch import checks, kernels, pictures
 from erl_torch.board import Board, hyperparameters, layout
 from erl_torch.chains import SingularChainError
-from erl_torch.checkpoint import Checkpoints, columns, digest, rows_of
+from erl_torch.checkpoint import Checkpoints, columns, rows_of
 from erl_torch.checks import InputError
 from erl_torch.config import check_keys
 from erl_torch.empirical import empirical_mdp
@@ -34,15 +34,16 @@ from erl_torch.envs.discretise import Discretise
 from erl_torch.envs.estimate import estimate_mdp
 from erl_torch.envs.grid_world import GridWorld
 from erl_torch.evaluation import Evaluation, evaluate, reward_per_step
-from erl_torch.experience import collect
+from erl_torch.experience import collect, record
 from erl_torch.files import read_npy, write_json
 from erl_torch.learners import LEARNERS, Exact, ExactState, NonFiniteError, S1State
 from erl_torch.mdp import TabularMDP, check_policy
 from erl_torch.models import MeanRewardWarning, absorbing, known_mdp, sizes, tabular_mdp
+from erl_torch.recordings import FileRecording, open_recording
 from erl_torch.rng import Streams, streams
 from erl_torch.solution import Solution, Status
 from erl_torch.solvers import certify, solve_soft_bellman
-from erl_torch.transitions import Transitions
+from erl_torch.transitions import Recording
 from erl_torch.uncertainty import Estimate, theta_uncertainty
 
 SafePoint = Callable[[], None]
@@ -98,7 +99,7 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
         n_states, n_actions = sizes(env)
         learner = make_learner(cfg.learner, n_states, n_actions)
         prior = check_policy("learner.prior_policy", learner.prior_policy, n_states, n_actions)
-        run = (_Solving if isinstance(learner, Exact) else _Learning)(cfg, world, learner, rng, prior, safe_point)
+        run = (_Solving if isinstance(learner, Exact) else _Learning)(cfg, env, world, learner, rng, prior, safe_point)
 
         e = cfg.evaluation
         horizon = min(e.horizon, (env.spec and env.spec.max_episode_steps) or e.horizon)
@@ -192,6 +193,7 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
     seconds = time.perf_counter() - began
     result = _result(cfg, solution, last, run.n_experience, clock.seconds, seconds)
     result["data"] = None if estimate is None else str(estimate)
+    result["n_skipped"] = run.n_skipped
     write_json(directory / "result.json", result)
     print(_summary(cfg, first, last, start, result, directory, run.unit))
     if stopped is not None:
@@ -216,6 +218,7 @@ class _Learning:
     def __init__(
         self,
         cfg: DictConfig,
+        env: gym.Env[Any, Any],
         world: World,
         learner: Any,
         rng: Streams,
@@ -224,9 +227,15 @@ class _Learning:
     ) -> None:
         self.learner, self.name = learner, cfg.learner.name
         self.sizes = sizes(world.source)
-        self.data = _experience(cfg.experience, world.source, *self.sizes, rng, prior, safe_point)
+        self.n_skipped = 0
+        self.data: Recording
+        if cfg.experience.name == "recorded":
+            found = recorded(cfg.experience, env, *self.sizes, cfg.seed, prior, safe_point)
+            self.data, self.n_skipped = found.held(), found.n_skipped
+        else:
+            self.data = _experience(cfg.experience, world.source, *self.sizes, rng, prior, safe_point)
         self.n_experience = len(self.data)
-        self.digest: int | None = digest(self.data)
+        self.digest: int | None = self.data.checksum()
         safe_point()
 
     def check(self, found: dict[str, Any] | None) -> dict[str, Any] | None:
@@ -286,12 +295,13 @@ class _Solving:
     """A run that solves the environment's model."""
 
     unit = "iterations"
-    n_experience = 0
+    n_experience = n_skipped = 0
     digest = None  # no stream, and no checkpoints: it begins anew
 
     def __init__(
         self,
         cfg: DictConfig,
+        env: gym.Env[Any, Any],
         world: World,
         learner: Exact,
         rng: Streams,
@@ -523,15 +533,42 @@ def make_learner(cfg: DictConfig, n_states: int, n_actions: int, key: str = "lea
         return learner
 
 
-def recorded(cfg: DictConfig, n_states: int, n_actions: int) -> Transitions:
+def recorded(
+    cfg: DictConfig, env: Any, n_states: int, n_actions: int, seed: int, prior: np.ndarray, safe_point: SafePoint
+) -> FileRecording:
     """The stream that ``cfg`` names. Raises InputError."""
-    with _group("experience"):
-        data = Transitions.load(cfg.path)
-        try:
-            data.check_range(n_states, n_actions)
-        except InputError as error:
-            raise InputError(f"path={cfg.path}: {error.key}", error.value, error.allowed) from error
-        return data
+    with _group("experience"), _collecting("reading", None, safe_point) as report:
+        data = FileRecording(
+            cfg.path,
+            n_states,
+            n_actions,
+            on_bad=cfg.on_bad,
+            chunk=cfg.chunk,
+            env=env,
+            prior_policy=prior,
+            on_prior=cfg.on_prior,
+            seed=seed,
+            report=report,
+        )
+    if data.n_skipped:
+        total = data.n_skipped + len(data)
+        said = f"; the first is {data.first_skipped}" if data.first_skipped else ""
+        print(f"note: {cfg.path}: {data.n_skipped:,} bad tuples of {total:,} left out{said}", file=sys.stderr)
+    return data
+
+
+@contextlib.contextmanager
+def _collecting(what: str, total: int | None, safe_point: SafePoint) -> Iterator[Callable[[int], None]]:
+    """A progress bar that is told how many tuples there are so far, and lets signals through."""
+    with tqdm(
+        total=total, desc=what, unit=" tuples", unit_scale=True, delay=1, leave=False, disable=None,
+    ) as bar:  # fmt: skip
+
+        def report(n: int) -> None:
+            bar.update(n - bar.n)
+            safe_point()
+
+        yield report
 
 
 def _experience(
@@ -542,23 +579,17 @@ def _experience(
     rng: Streams,
     prior: np.ndarray,
     safe_point: Callable[[], None],
-) -> Transitions:
-    if cfg.name == "recorded":
-        return recorded(cfg, n_states, n_actions)
+) -> Recording:
     with _group("experience"):
         behaviour = None
         if cfg.behaviour_policy is not None:
             behaviour = read_npy(cfg.behaviour_policy, "behaviour_policy")
-        with tqdm(
-            total=cfg.n_episodes * cfg.episode_length if cfg.n_episodes >= 1 and cfg.episode_length >= 1 else 0,
-            desc="collecting", unit=" tuples", unit_scale=True, delay=1, leave=False, disable=None,
-        ) as bar:  # fmt: skip
-
-            def report(n: int) -> None:
-                bar.update(n - bar.n)
-                safe_point()
-
-            data = collect(source, cfg.n_episodes, cfg.episode_length, rng, behaviour, prior, report)
+        total = cfg.n_episodes * cfg.episode_length if cfg.n_episodes >= 1 and cfg.episode_length >= 1 else 0
+        with _collecting("collecting", total, safe_point) as report:
+            arguments = cfg.n_episodes, cfg.episode_length, rng, behaviour, prior, report
+            if cfg.save_to is not None and cfg.save_to.endswith("/"):
+                return open_recording(record(source, cfg.save_to, *arguments), n_states, n_actions)
+            data = collect(source, *arguments)
         if cfg.save_to is not None:
             data.save(cfg.save_to)
         return data

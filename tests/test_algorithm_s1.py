@@ -12,6 +12,7 @@ from conftest import problems, random_mdp, random_policy, random_stream
 from hypothesis import strategies as st
 
 from erl_torch import AlgorithmS1, InputError, NonFiniteError, Solution, Status, Transitions, collect, kernels
+from erl_torch.empirical import tally
 from erl_torch.envs.windy_cliff import WindyCliffEnv
 
 IMPLEMENTATIONS = ("fast", "literal")
@@ -249,9 +250,9 @@ def test_affine_psi_phase_is_the_sequential_one(problem, lr_psi, epochs):
     n_states, n_actions = mdp.reward.shape
     data = random_stream(rng, mdp, 150)
     pair = data.s * np.int32(n_actions) + data.a
-    counts = kernels.visit_counts(pair, n_states * n_actions)
+    found = tally(data, n_states, n_actions, lr_psi)
+    counts, affine = found.visits, found.psi_map
     assert np.array_equal(counts, np.bincount(pair, minlength=n_states * n_actions))
-    affine = kernels.psi_map(pair, data.s_next, counts, n_states, lr_psi)
     psi = rng.lognormal(size=n_states)
     mean_psi, mean_log_psi = np.ones(n_states * n_actions), np.zeros(n_states * n_actions)
     done, change = kernels.psi_phase(
@@ -269,10 +270,10 @@ def test_affine_psi_phase_is_the_sequential_one(problem, lr_psi, epochs):
 
 
 def test_psi_map_sorts_its_columns_and_forgets_old_visits():
-    pair = np.zeros(20_000, np.int32)
+    zeros = np.zeros(20_000, np.int32)
     s_next = np.concatenate([np.full(19_000, 2), np.tile([1, 0], 500)]).astype(np.int32)
-    indptr, indices, data = kernels.psi_map(pair, s_next, np.array([20_000]), 3, 0.9)
-    assert indptr.tolist() == [0, 2]
+    indptr, indices, data = tally(Transitions(zeros, zeros, zeros, s_next, zeros), 3, 1, 0.9).psi_map
+    assert indptr.tolist() == [0, 2, 2, 2]
     assert indices.tolist() == [0, 1]
     np.testing.assert_allclose(data, [0.9 / (1 - 0.01), 0.09 / (1 - 0.01)], rtol=1e-12)
 

@@ -11,7 +11,7 @@ from test_config import composed
 from test_training import events
 
 from erl_torch import AlgorithmS1, InputError, NonFiniteError, Replicas, Simulation, Solution, Status, collect
-from erl_torch.checkpoint import Checkpoints, decode, digest, encode
+from erl_torch.checkpoint import Checkpoints, decode, encode
 from erl_torch.event_file import EventFile
 from erl_torch.learners import LEARNERS
 from erl_torch.training import train
@@ -211,13 +211,13 @@ def test_values_come_back_as_they_were():
         decode({"class": "Path"})
 
 
-def test_digest_sees_every_column():
+def test_checksum_sees_every_column():
     data = collect(random_mdp(np.random.default_rng(0), 4, 3), 1, 50, 0)
-    found = {digest(data)}
+    found = {data.checksum()}
     for name in ("s", "a", "r", "s_next", "a_next"):
         column = getattr(data, name).copy()
         column[-1] += 1
-        found.add(digest(type(data)(**{**vars(data), name: column})))
+        found.add(type(data)(**{**vars(data), name: column}).checksum())
     assert len(found) == 6
 
 

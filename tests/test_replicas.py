@@ -27,6 +27,7 @@ from erl_torch import (
     kernels,
     solve_soft_bellman,
 )
+from erl_torch.empirical import tally
 from erl_torch.evaluation import Judge, objective, reward_per_step
 from erl_torch.learners import LEARNERS
 from erl_torch.learners.replicas import tuples_of
@@ -489,6 +490,6 @@ def test_survey_is_the_map_of_the_recorded_stream(small):
     for r, d in enumerate(data):
         pair = d.s * np.int32(3) + d.a
         assert np.array_equal(visits[r], np.bincount(pair, minlength=18))
-        indptr, indices, values = kernels.psi_map(pair, d.s_next, visits[r], 6, lr[r])
+        indptr, indices, values = tally(d, 6, 3, lr[r]).psi_map
         sparse = type(p)((weight[r], p.indices, p.indptr), shape=p.shape)
         assert np.array_equal(sparse.toarray(), type(p)((values, indices, indptr), shape=p.shape).toarray())

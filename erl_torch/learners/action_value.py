@@ -42,7 +42,7 @@ from erl_torch.checks import InputError
 from erl_torch.learners.fitting import NonFiniteError, epochs, run_to_end
 from erl_torch.mdp import check_policy
 from erl_torch.solution import Solution, Status
-from erl_torch.transitions import Transitions
+from erl_torch.transitions import Parts, Recording, Transitions
 
 BLOCK = 1 << 22  # tuples a compiled call, so that signals are served several times a second
 LARGEST = 1e300  # of beta |q|: differences must stay finite
@@ -95,8 +95,8 @@ class ActionValueState:
 class ActionValueStream:
     """A stream as the compiled loop takes it."""
 
-    data: Transitions
-    pair: np.ndarray  # [N] int32, s * A + a
+    data: Recording
+    parts: Parts[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]  # s, s * A + a, s' and r, a chunk each
     reference: int  # state that is visited most
 
 
@@ -130,7 +130,7 @@ class ActionValueLearner:
             raise InputError("power", self.power, "a number in (0.5, 1]")
         checks.at_least("n_epochs", self.n_epochs, 1)
 
-    def fit(self, transitions: Transitions, n_states: int, n_actions: int) -> Solution:
+    def fit(self, transitions: Recording, n_states: int, n_actions: int) -> Solution:
         """Run to the end and return the solution; Status.NON_FINITE with the last good pass if a table overflows.
 
         Raises InputError: a state or action out of range, or a prior policy of the wrong shape.
@@ -138,7 +138,7 @@ class ActionValueLearner:
         return run_to_end(self, transitions, n_states, n_actions)
 
     def iterate(
-        self, transitions: Transitions, n_states: int, n_actions: int, state: ActionValueState | None = None
+        self, transitions: Recording, n_states: int, n_actions: int, state: ActionValueState | None = None
     ) -> Iterator[ActionValueState]:
         """Yield the state after each pass, n_epochs times. Raises NonFiniteError."""
         yield from epochs(self, transitions, n_states, n_actions, state)
@@ -183,18 +183,24 @@ class ActionValueLearner:
             rate=0.0 if self._discount == 1.0 else None,
         )
 
-    def prepare(self, transitions: Transitions, n_states: int, n_actions: int) -> ActionValueStream:
+    def prepare(self, transitions: Recording, n_states: int, n_actions: int) -> ActionValueStream:
         """Validate the stream against the sizes."""
         transitions.check_range(n_states, n_actions)
         if n_states * n_actions > np.iinfo(np.int32).max:
             raise InputError("n_states * n_actions", n_states * n_actions, "below 2**31")
-        reference = int(np.argmax(kernels.visit_counts(transitions.s, n_states)))
-        return ActionValueStream(transitions, transitions.s * np.int32(n_actions) + transitions.a, reference)
+        visits = np.zeros(n_states, np.int64)
+        for chunk in transitions.chunks():
+            visits += np.bincount(chunk.s, minlength=n_states)
+
+        def part(chunk: Transitions) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+            return chunk.s, chunk.s * np.int32(n_actions) + chunk.a, chunk.s_next, chunk.r
+
+        return ActionValueStream(transitions, Parts(transitions, part), int(np.argmax(visits)))
 
     def step(self, state: ActionValueState, stream: ActionValueStream) -> ActionValueState:
         """One pass over the stream. Raises NonFiniteError."""
         q, visits = state.q.clone(), state.visits.clone()
-        rate = self._pass(stream.pair, stream, state.prior_policy.numpy(), q.numpy(), visits.numpy(), state.rate or 0.0)
+        rate = self._pass(stream, state.prior_policy.numpy(), q.numpy(), visits.numpy(), state.rate or 0.0)
         self._check(q, rate, state, stream)
         return replace(
             state,
@@ -217,14 +223,13 @@ class ActionValueLearner:
 
     def _pass(
         self,
-        pair: np.ndarray,  # [N], into the tables
         stream: ActionValueStream,
         prior: np.ndarray,  # [S, A]
         q: np.ndarray,  # [S, A], changes in place
         visits: np.ndarray,  # [S, A], changes in place
         rate: float,
+        of_states: bool = False,  # tables of states, [S, 1]
     ) -> float:
-        data = stream.data
         lr_rate, reference = self._rate(stream, q.size)
         settings = (
             prior.ravel(),
@@ -239,9 +244,11 @@ class ActionValueLearner:
             q.reshape(-1),
             visits.reshape(-1),
         )
-        for begin in range(0, len(data), BLOCK):
-            part = slice(begin, begin + BLOCK)
-            rate = kernels.action_value_epoch(pair[part], data.s_next[part], data.r[part], *settings, rate)
+        for s, pair, s_next, r in stream.parts:
+            for begin in range(0, len(s), BLOCK):
+                part = slice(begin, begin + BLOCK)
+                here = s[part] if of_states else pair[part]
+                rate = kernels.action_value_epoch(here, s_next[part], r[part], *settings, rate)
         return rate
 
     def _check(self, table: torch.Tensor, rate: float, before: ActionValueState, stream: ActionValueStream) -> None:

@@ -71,11 +71,12 @@ import torch
 
 from erl_torch import checks, kernels
 from erl_torch.checks import InputError
+from erl_torch.empirical import tally
 from erl_torch.learners import listing
 from erl_torch.learners.fitting import NonFiniteError, epochs, run_to_end
 from erl_torch.mdp import check_policy
 from erl_torch.solution import Solution, Status
-from erl_torch.transitions import Transitions
+from erl_torch.transitions import Parts, Recording, Transitions, tuple_at
 
 LOG_PSI_EPSILON = 1e-10  # keeps the relative error of <log psi> finite where it is 0
 BLOCK = 1 << 24  # tuples a compiled call, so that signals are served several times a second
@@ -136,16 +137,37 @@ class S1State:
 class S1Stream:
     """A stream made ready for the compiled loops: done once a fit."""
 
-    data: Transitions
+    data: Recording
     visited: np.ndarray  # [S, A] bool
-    pair: np.ndarray  # [N] int32, s * A + a
-    pair_next: np.ndarray  # [N] int32, s' * A + a'
+    parts: Parts[tuple[np.ndarray, np.ndarray, np.ndarray]]  # pair, pair_next and factor below, a chunk each
     reward: np.ndarray  # [S*A]; all 0 where `noisy`
-    factor: np.ndarray  # [N] exp(beta r) where `noisy`, else [1]
     noisy: bool  # rewards vary for the same (s, a)
     decay: np.ndarray  # [S*A], (1 - lr_psi) ** visits
     psi_map: tuple[np.ndarray, np.ndarray, np.ndarray]  # W, CSR [S*A, S]
     rho_max: float
+
+    # Of a stream in memory:
+
+    @property
+    def r(self) -> np.ndarray:
+        """[N]"""
+        assert isinstance(self.data, Transitions)
+        return self.data.r
+
+    @property
+    def pair(self) -> np.ndarray:
+        """[N] int32, s * A + a."""
+        return self.parts.whole[0]
+
+    @property
+    def pair_next(self) -> np.ndarray:
+        """[N] int32, s' * A + a'."""
+        return self.parts.whole[1]
+
+    @property
+    def factor(self) -> np.ndarray:
+        """[N] exp(beta r) where ``noisy``, else [1]."""
+        return self.parts.whole[2]
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,7 +233,7 @@ class AlgorithmS1:
 
     # -- the whole run ------------------------------------------------------------------------------
 
-    def fit(self, transitions: Transitions, n_states: int, n_actions: int) -> Solution:
+    def fit(self, transitions: Recording, n_states: int, n_actions: int) -> Solution:
         """Run to the end and return the solution.
 
         A run that leaves the finite numbers ends with ``Status.NON_FINITE``, the tables of the last good
@@ -223,7 +245,7 @@ class AlgorithmS1:
         return run_to_end(self, transitions, n_states, n_actions)
 
     def iterate(
-        self, transitions: Transitions, n_states: int, n_actions: int, state: S1State | None = None
+        self, transitions: Recording, n_states: int, n_actions: int, state: S1State | None = None
     ) -> Iterator[S1State]:
         """Yield the state after each epoch of the u phase: n_bias * n_epochs times, or what is left after ``state``.
 
@@ -294,28 +316,26 @@ class AlgorithmS1:
             psi_epochs=0,
         )
 
-    def prepare(self, transitions: Transitions, n_states: int, n_actions: int) -> S1Stream:
-        """Validate the stream against the sizes and compute what is the same in every epoch."""
-        transitions.check_range(n_states, n_actions)
-        n_pairs = n_states * n_actions
-        if n_pairs > np.iinfo(np.int32).max:
-            raise InputError("n_states * n_actions", n_pairs, "below 2**31")
-        pair = transitions.s * np.int32(n_actions) + transitions.a
-        counts = kernels.visit_counts(pair, n_pairs)
-        reward = np.zeros(n_pairs)
-        reward[pair] = transitions.r
-        noisy = bool((reward[pair] != transitions.r).any())
-        rho_max = self.largest_rho(float(transitions.r.max()))
+    def prepare(self, transitions: Recording, n_states: int, n_actions: int) -> S1Stream:
+        """Validate the stream against the sizes and compute what is the same in every epoch: one pass."""
+        if self.implementation == "literal" and not isinstance(transitions, Transitions):
+            raise InputError("implementation", "literal", "fast, where the stream is not in memory")
+        found = tally(transitions, n_states, n_actions, self.lr_psi)
+
+        def part(chunk: Transitions) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            pair = chunk.s * np.int32(n_actions) + chunk.a
+            pair_next = chunk.s_next * np.int32(n_actions) + chunk.a_next
+            return pair, pair_next, np.exp(self.beta * chunk.r) if found.varied else np.ones(1)
+
+        rho_max = self.largest_rho(found.reward_range[1])
         return S1Stream(
             data=transitions,
-            visited=(counts > 0).reshape(n_states, n_actions),
-            pair=pair,
-            pair_next=transitions.s_next * np.int32(n_actions) + transitions.a_next,
-            reward=np.zeros(n_pairs) if noisy else reward,
-            factor=np.exp(self.beta * transitions.r) if noisy else np.ones(1),
-            noisy=noisy,
-            decay=(1 - self.lr_psi) ** counts.astype(np.float64),
-            psi_map=kernels.psi_map(pair, transitions.s_next, counts, n_states, self.lr_psi),
+            visited=(found.visits > 0).reshape(n_states, n_actions),
+            parts=Parts(transitions, part, self.rescale(n_states * n_actions)),
+            reward=np.zeros(n_states * n_actions) if found.varied else found.last_reward,
+            noisy=found.varied,
+            decay=(1 - self.lr_psi) ** found.visits.astype(np.float64),
+            psi_map=found.psi_map,
             rho_max=rho_max,
         )
 
@@ -416,6 +436,7 @@ class AlgorithmS1:
         while epochs < self.max_psi_epochs and not error < self.psi_tol:
             epochs += 1
             before, log_before = mean_psi.clone(), mean_log_psi.clone()
+            assert isinstance(stream.data, Transitions)
             listing.psi_epoch(
                 stream.data,
                 _walkable(psi),
@@ -445,31 +466,34 @@ class AlgorithmS1:
         rescale_every = self.rescale(n_states * n_actions)
         inv_rho = 1 / state.rho
         t = 0
-        while t < len(stream.data):
-            stop = min(len(stream.data), t + BLOCK)
-            inv_rho, t = kernels.u_epoch(
-                stream.pair,
-                stream.pair_next,
-                stream.factor,
-                stream.noisy,
-                g,
-                table,
-                inv_rho,
-                self.lr_u,
-                self.rate_of_rho(n_states),
-                1 / stream.rho_max,
-                self.self_loop == "new",
-                rescale_every,
-                t,
-                stop,
-            )
-            if t < stop:
-                break
-        rho = 1 / inv_rho if inv_rho else math.inf
-        return z / psi[:, None], rho, t
+        for pair, pair_next, factor in stream.parts:
+            first, last = t, t + len(pair)
+            while t < last:
+                stop = min(last, t - t % BLOCK + BLOCK)
+                inv_rho, t = kernels.u_epoch(
+                    pair,
+                    pair_next,
+                    factor,
+                    stream.noisy,
+                    g,
+                    table,
+                    inv_rho,
+                    self.lr_u,
+                    self.rate_of_rho(n_states),
+                    1 / stream.rho_max,
+                    self.self_loop == "new",
+                    rescale_every,
+                    t,
+                    stop,
+                    first,
+                )
+                if t < stop:
+                    return z / psi[:, None], _inverse(inv_rho), t
+        return z / psi[:, None], _inverse(inv_rho), t
 
     def _u_epoch_literal(self, state: S1State, stream: S1Stream) -> tuple[np.ndarray, float, int]:
         u = state.u.clone()
+        assert isinstance(stream.data, Transitions)
         rho, t = listing.u_epoch(
             stream.data,
             _walkable(state.psi_in_use),
@@ -503,13 +527,17 @@ class AlgorithmS1:
         return max(1.0, math.exp(exponent)) if self.clip_rho else math.inf
 
     def _failure(self, state: S1State, stream: S1Stream, t: int) -> NonFiniteError:
-        data = stream.data
+        s, a, r = tuple_at(stream.data, t)
         return NonFiniteError(
             state.n_tuples + t + 1,
             f"u or rho is no longer a positive finite number at tuple {t} "
-            f"(s={data.s[t]}, a={data.a[t]}, r={data.r[t]:g}) of biasing iteration {state.bias_iteration}, "
-            f"epoch {state.epoch + 1}: beta*r = {self.beta * data.r[t]:g}; lower beta or the step sizes",
+            f"(s={s}, a={a}, r={r:g}) of biasing iteration {state.bias_iteration}, "
+            f"epoch {state.epoch + 1}: beta*r = {self.beta * r:g}; lower beta or the step sizes",
         )
+
+
+def _inverse(x: float) -> float:
+    return 1 / x if x else math.inf
 
 
 def _walkable(table: torch.Tensor) -> torch.Tensor | np.ndarray:

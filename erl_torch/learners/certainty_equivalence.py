@@ -23,7 +23,7 @@ from erl_torch.learners.fitting import epochs
 from erl_torch.mdp import check_policy
 from erl_torch.solution import Solution, Status
 from erl_torch.solvers.soft_bellman import solve_problem
-from erl_torch.transitions import Transitions
+from erl_torch.transitions import Recording
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,13 +94,13 @@ class CertaintyEquivalence:
         checks.positive("tol", self.tol)
         checks.at_least("max_steps", self.max_steps, 1)
 
-    def fit(self, transitions: Transitions, n_states: int, n_actions: int) -> Solution:
+    def fit(self, transitions: Recording, n_states: int, n_actions: int) -> Solution:
         """Count and solve. Status REDUCIBLE, with a message, where the stream shows several closed sets of states."""
         (state,) = self.iterate(transitions, n_states, n_actions)
         return self.solution(state, [state.metrics()])
 
     def iterate(
-        self, transitions: Transitions, n_states: int, n_actions: int, state: CertaintyEquivalenceState | None = None
+        self, transitions: Recording, n_states: int, n_actions: int, state: CertaintyEquivalenceState | None = None
     ) -> Iterator[CertaintyEquivalenceState]:
         """Yield the one state."""
         yield from epochs(self, transitions, n_states, n_actions, state)
@@ -115,7 +115,7 @@ class CertaintyEquivalence:
         zero, one = torch.zeros_like(prior), torch.ones_like(prior)
         return CertaintyEquivalenceState(0, 0, self.beta, prior, prior, one, 1.0, 0.0, zero, math.inf)
 
-    def prepare(self, transitions: Transitions, n_states: int, n_actions: int) -> CertaintyEquivalenceStream:
+    def prepare(self, transitions: Recording, n_states: int, n_actions: int) -> CertaintyEquivalenceStream:
         """Count. Raises InputError for tuples out of range, or a stream that never returns to any state."""
         model = empirical_mdp(transitions, n_states, n_actions)
         return CertaintyEquivalenceStream(model, model.problem(self.beta, self.prior_policy), len(transitions))

@@ -69,14 +69,14 @@ from scipy.special import logsumexp
 
 from erl_torch import checks, kernels
 from erl_torch.checks import InputError
-from erl_torch.empirical import EmpiricalMDP, EmpiricalProblem, empirical_mdp
+from erl_torch.empirical import EmpiricalMDP, EmpiricalProblem, empirical_mdp, tally
 from erl_torch.evaluation import kl_per_state
 from erl_torch.learners.algorithm_s1 import BLOCK, LOG_PSI_EPSILON
 from erl_torch.learners.fitting import NonFiniteError, epochs, run_to_end
 from erl_torch.mdp import check_policy
 from erl_torch.solution import Solution, Status
 from erl_torch.solvers.problem import soft_backup
-from erl_torch.transitions import Transitions
+from erl_torch.transitions import Parts, Recording, Selection, Transitions
 
 LAST_STEP = 100_000  # visits of a pair in one biasing iteration after which its step stays
 SAFE_RANGE = 180.0  # of logarithms, for plain numbers: products of four such stay in range
@@ -161,10 +161,10 @@ class EfficientStream:
     """A stream made ready for the compiled loops: done once a fit."""
 
     n_tuples: int  # of the whole stream, those that take no part included
-    pair: np.ndarray  # [N] int32, s * A + a
-    after: np.ndarray  # [N] int32: s', or s' * A + a'
-    log_factor: np.ndarray  # [N] beta r where `noisy`, else [0]
+    parts: Parts[tuple[np.ndarray, np.ndarray, np.ndarray]]  # a chunk each, int32, int32, float64:
+    #   s * A + a; s', or s' * A + a'; beta r where `noisy`, else [0]
     noisy: bool
+    log_factor_max: float  # of |beta r| where `noisy`, else 0
     model: EmpiricalMDP
     part: EmpiricalProblem
     weight: torch.Tensor  # [S, A]
@@ -250,7 +250,7 @@ class EfficientS1:
 
     # -- the whole run ------------------------------------------------------------------------------
 
-    def fit(self, transitions: Transitions, n_states: int, n_actions: int) -> Solution:
+    def fit(self, transitions: Recording, n_states: int, n_actions: int) -> Solution:
         """Run to the end and return the solution.
 
         Status CONVERGED once certified, COMPLETED after n_bias iterations; NON_FINITE only with
@@ -263,7 +263,7 @@ class EfficientS1:
         return run_to_end(self, transitions, n_states, n_actions)
 
     def iterate(
-        self, transitions: Transitions, n_states: int, n_actions: int, state: EfficientState | None = None
+        self, transitions: Recording, n_states: int, n_actions: int, state: EfficientState | None = None
     ) -> Iterator[EfficientState]:
         """Yield the state after each epoch: n_bias * n_epochs times, or until certified."""
         yield from epochs(self, transitions, n_states, n_actions, state)
@@ -411,37 +411,49 @@ class EfficientS1:
             mean_log_psi=zero,
         )
 
-    def prepare(self, transitions: Transitions, n_states: int, n_actions: int) -> EfficientStream:
-        """Validate the stream against the sizes and compute what is the same in every epoch."""
-        data = transitions
-        model = empirical_mdp(data, n_states, n_actions)
+    def prepare(self, transitions: Recording, n_states: int, n_actions: int) -> EfficientStream:
+        """Validate the stream against the sizes and compute what is the same in every epoch: one pass, or a few."""
+        data, lr_psi = transitions, 0.0 if self.sample_mean_psi else self.lr_psi
+        found = tally(data, n_states, n_actions, lr_psi)
+        model = empirical_mdp(data, n_states, n_actions, found)
         part = model.problem(self.beta, self.prior_policy)
         prior = check_policy("prior_policy", self.prior_policy, n_states, n_actions)
         weight = prior
         if self.unvisited == "exclude":
             inside = np.asarray(part.used.any(1))
-            takes_part = part.used[data.s, data.a] & inside[data.s_next]
-            if not takes_part.all():
-                data = Transitions(*(getattr(data, name)[takes_part] for name in ("s", "a", "r", "s_next", "a_next")))
-                model = empirical_mdp(data, n_states, n_actions)
+            met = np.repeat(part.used.ravel(), np.diff(found.indptr)) & inside[found.indices]
+            if not met.all():
+
+                def takes_part(chunk: Transitions) -> np.ndarray:
+                    return np.asarray(part.used[chunk.s, chunk.a] & inside[chunk.s_next])
+
+                if isinstance(data, Transitions):
+                    data = data.where(takes_part(data))
+                else:
+                    data = Selection(data, takes_part, int(found.counts[met].sum()))
+                found = tally(data, n_states, n_actions, lr_psi)
+                model = empirical_mdp(data, n_states, n_actions, found)
             weight = prior * (part.used | ~inside[:, None])
-        pair = data.s * np.int32(n_actions) + data.a
         visits = model.visits.ravel()
         visited = np.flatnonzero(visits)
         indptr, indices, values = model.transition.indptr, model.transition.indices, model.transition.data
         log_keep = np.full(len(visited), -np.inf)
         if not self.sample_mean_psi:
-            indptr, indices, values = kernels.psi_map(pair, data.s_next, visits, n_states, self.lr_psi)
+            indptr, indices, values = found.psi_map
             values = values / np.repeat(np.add.reduceat(values, indptr[visited]), np.diff(indptr)[visited])
             with np.errstate(divide="ignore"):
                 log_keep = visits[visited] * np.log1p(-self.lr_psi)
-        noisy = not self.mean_reward and bool((model.reward.ravel()[pair] != data.r).any())
+        noisy = not self.mean_reward and found.varied
+
+        def columns(chunk: Transitions) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            after = chunk.s_next if self.expected_backup else chunk.s_next * np.int32(n_actions) + chunk.a_next
+            return chunk.s * np.int32(n_actions) + chunk.a, after, self.beta * chunk.r if noisy else np.zeros(1)
+
         return EfficientStream(
             n_tuples=len(transitions),
-            pair=pair,
-            after=data.s_next if self.expected_backup else data.s_next * np.int32(n_actions) + data.a_next,
-            log_factor=self.beta * data.r if noisy else np.zeros(1),
+            parts=Parts(data, columns, self._rescale_every(n_states * n_actions)),
             noisy=noisy,
+            log_factor_max=max(abs(self.beta * r) for r in found.reward_range) if noisy else 0.0,
             model=model,
             part=part,
             weight=torch.from_numpy(weight),
@@ -449,7 +461,7 @@ class EfficientS1:
             visited=visited,
             psi_rows=(np.append(indptr[visited], len(values)), indices, values),
             log_keep=log_keep,
-            log_rho_max=max(0.0, self.beta * float(data.r.max())),
+            log_rho_max=max(0.0, self.beta * found.reward_range[1]),
         )
 
     def step(self, state: EfficientState, stream: EfficientStream) -> EfficientState:
@@ -545,7 +557,7 @@ class EfficientS1:
         top = state.log_z.numpy()[stream.inside].max()
         log_z, log_total = np.where(stream.inside, state.log_z - top, 0.0), state.log_total.numpy() - top
         log_g = np.where(stream.inside, log_g, 0.0)
-        span = max(np.abs(log_g).max(), np.abs(stream.log_factor).max(), -log_z.min(), abs(state.log_rho))
+        span = max(np.abs(log_g).max(), stream.log_factor_max, -log_z.min(), abs(state.log_rho))
         with np.errstate(all="ignore"):
             if self.log_domain == "off" or (self.log_domain == "auto" and span < SAFE_RANGE):
                 tables = [np.exp(x) for x in (log_g, log_z, log_total)]
@@ -576,34 +588,44 @@ class EfficientS1:
         lr_rho = self.lr_u / n_states if self.lr_rho is None else self.lr_rho
         lr_rho = lr_rho / (state.epoch + 1) if self.clocks else lr_rho
         visits = (stream.model.visits * state.epoch).ravel()
-        rho, factor, rho_max = number(state.log_rho), number(stream.log_factor), number(stream.log_rho_max)
+        rho, rho_max = number(state.log_rho), number(stream.log_rho_max)
         weight = number(state.weight.log().numpy().ravel())
         average = self.polyak and state.epoch >= self.n_epochs // 2
-        for begin in range(0, len(stream.pair), BLOCK):
-            rho, healthy = kernel(
-                stream.pair,
-                stream.after,
-                factor,
-                stream.noisy,
-                g.ravel(),
-                z.reshape(-1),
-                total.reshape(-1),
-                average,
-                weight,
-                n_actions,
-                self.steps(),
-                visits,
-                float(rho),
-                lr_rho,
-                float(rho_max),
-                self.expected_backup,
-                max(5000, z.size),
-                begin,
-                min(begin + BLOCK, len(stream.pair)),
-            )
-            if not healthy:
-                break
-        return rho, healthy
+        t = 0
+        for pair, after, log_factor in stream.parts:
+            first, last, factor = t, t + len(pair), number(log_factor)
+            while t < last:
+                stop = min(last, t - t % BLOCK + BLOCK)
+                rho, healthy = kernel(
+                    pair,
+                    after,
+                    factor,
+                    stream.noisy,
+                    g.ravel(),
+                    z.reshape(-1),
+                    total.reshape(-1),
+                    average,
+                    weight,
+                    n_actions,
+                    self.steps(),
+                    visits,
+                    float(rho),
+                    lr_rho,
+                    float(rho_max),
+                    self.expected_backup,
+                    self._rescale_every(z.size),
+                    t,
+                    stop,
+                    first,
+                )
+                if not healthy:
+                    return rho, False
+                t = stop
+        return rho, True
+
+    def _rescale_every(self, n_pairs: int) -> int:
+        """Tuples between rescalings of z."""
+        return max(5000, n_pairs)
 
 
 SWITCHES = (

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from erl_torch.solution import Solution
-from erl_torch.transitions import Transitions
+from erl_torch.transitions import Recording
 
 
 class NonFiniteError(ArithmeticError):
@@ -20,7 +20,7 @@ class NonFiniteError(ArithmeticError):
         return f"step {self.step}: {self.cause}"
 
 
-def epochs(learner: Any, transitions: Transitions, n_states: int, n_actions: int, state: Any = None) -> Iterator[Any]:
+def epochs(learner: Any, transitions: Recording, n_states: int, n_actions: int, state: Any = None) -> Iterator[Any]:
     """The states of ``learner`` after each epoch, from ``state`` on, until it is finished.
 
     Raises what its ``step`` raises.
@@ -32,7 +32,7 @@ def epochs(learner: Any, transitions: Transitions, n_states: int, n_actions: int
         yield state
 
 
-def run_to_end(learner: Any, transitions: Transitions, n_states: int, n_actions: int) -> Solution:
+def run_to_end(learner: Any, transitions: Recording, n_states: int, n_actions: int) -> Solution:
     """The solution of the last good state of ``learner.iterate``, with one ``metrics()`` of history for each."""
     state = learner.init(n_states, n_actions)
     history: list[dict[str, float]] = []

@@ -266,6 +266,8 @@ class Replicas:
                 raise InputError(f"learners[{r}].prior_policy", "array", "that of all replicas")
         if isinstance(experience, Transitions):
             return
+        if hasattr(experience, "chunks"):
+            raise InputError("experience", "a recording in files", "in memory: recording.load()")
         streams = experience.seeds if isinstance(experience, Simulation) else experience
         if len(streams) != len(self):
             raise InputError("experience", f"{len(streams)} streams", f"one, or one for each of {len(self)} replicas")

@@ -320,7 +320,7 @@ class Engine:
                 blocks.append(self._shared_block(part, each[0]))
                 continue
             columns = [np.stack([getattr(s, name) for s in inside], axis=1) for name in ("pair", "pair_next")]
-            rewards = np.stack([s.data.r for s in inside], axis=1) if noisy else None
+            rewards = np.stack([s.r for s in inside], axis=1) if noisy else None
             if rewards is not None:
                 rewards[:, [not s.noisy for s in inside]] = 0.0  # in their tables
             blocks.append(self._lanes_block(part, columns[0], columns[1], rewards))
@@ -330,7 +330,7 @@ class Engine:
             visited=np.stack([stream.visited for stream in tables]),
             decay=np.stack([stream.decay for stream in each]),
             psi_maps=[stream.psi_map for stream in each],
-            rho_max=self._rho_max(np.array([stream.data.r.max() for stream in each])),
+            rho_max=self._rho_max(np.array([stream.r.max() for stream in each])),
             blocks=blocks,
         )
 
@@ -353,7 +353,7 @@ class Engine:
 
     def _shared_block(self, part: slice, stream: S1Stream) -> Block:
         """One recorded stream for all lanes."""
-        r = stream.data.r[:, None] if stream.noisy else None
+        r = stream.r[:, None] if stream.noisy else None
         if self._on_torch:
             return self._torch_block(part, lambda i, j: (stream.pair[i:j, None], stream.pair_next[i:j, None]), r)
 

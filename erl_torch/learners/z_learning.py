@@ -24,7 +24,6 @@ import numpy as np
 import torch
 
 from erl_torch.learners.action_value import ActionValueState, ActionValueStream, _Average
-from erl_torch.transitions import Transitions
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,9 +61,9 @@ class ZLearning(_Average):
         assert isinstance(state, ZState)
         value, visits = state.value.clone(), state.state_visits.clone()
         column, visits_column = value.numpy()[:, None], visits.numpy()[:, None]
-        rate = self._pass(stream.data.s, stream, np.ones_like(column), column, visits_column, state.rate or 0.0)
+        rate = self._pass(stream, np.ones_like(column), column, visits_column, state.rate or 0.0, of_states=True)
         self._check(value, rate, state, stream)
-        q, counts = _read_out(stream.pair, stream.data, value.numpy(), rate, self.beta, state.q.shape)
+        q, counts = _read_out(stream, value.numpy(), rate, self.beta, state.q.shape)
         return replace(
             state,
             epoch=state.epoch + 1,
@@ -78,14 +77,16 @@ class ZLearning(_Average):
 
 
 def _read_out(
-    pair: np.ndarray, data: Transitions, value: np.ndarray, rate: float, beta: float, shape: torch.Size
+    stream: ActionValueStream, value: np.ndarray, rate: float, beta: float, shape: torch.Size
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """(log(mean of exp(beta (r - g + v(s'))))/beta, visits) of every pair, [S, A]; 0 without visits."""
-    target = data.r - rate + value[data.s_next]
-    counts = np.bincount(pair, minlength=shape.numel())
-    top = np.full(shape.numel(), -np.inf)
-    np.maximum.at(top, pair, target)
+    counts = np.zeros(shape.numel(), np.int64)
+    top, total = np.full(shape.numel(), -np.inf), np.zeros(shape.numel())
+    for _, pair, s_next, r in stream.parts:
+        counts += np.bincount(pair, minlength=shape.numel())
+        np.maximum.at(top, pair, r - rate + value[s_next])
     top[counts == 0] = 0.0
-    total = np.bincount(pair, np.exp(beta * (target - top[pair])), minlength=shape.numel())
+    for _, pair, s_next, r in stream.parts:
+        np.add.at(total, pair, np.exp(beta * (r - rate + value[s_next] - top[pair])))
     mean = np.divide(total, counts, out=np.ones_like(total), where=counts > 0)
     return torch.from_numpy(top + np.log(mean) / beta).reshape(shape), torch.from_numpy(counts).reshape(shape)

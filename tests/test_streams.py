@@ -1,0 +1,453 @@
+"""Streams of any size: the same bits however they are cut and wherever they are read from; damage is named."""
+
+import contextlib
+import io
+import json
+import re
+import warnings
+from dataclasses import fields
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from conftest import random_mdp
+
+from erl_torch import (
+    AlgorithmS1,
+    CertaintyEquivalence,
+    EfficientS1,
+    FileRecording,
+    InputError,
+    Replicas,
+    Transitions,
+    collect,
+    open_recording,
+    record,
+    save_columns,
+)
+from erl_torch.empirical import empirical_mdp, tally
+from erl_torch.learners import LEARNERS
+from erl_torch.recordings import ColumnWriter
+from erl_torch.rng import streams
+from erl_torch.transitions import COLUMNS, Parts, regroup
+
+MDP = random_mdp(np.random.default_rng(0), 5, 3)
+PLAIN = collect(MDP, 13, 1000, 1)
+NOISY = Transitions(
+    PLAIN.s, PLAIN.a, PLAIN.r + np.random.default_rng(2).standard_normal(len(PLAIN)), PLAIN.s_next, PLAIN.a_next
+)
+SHORT = NOISY.first(40)
+# (2, 1) leads to where nothing is known: EfficientS1 leaves it out.
+ENDS = NOISY.where(np.arange(6000))
+ENDS.s_next[-1], ENDS.s[-1], ENDS.a[-1] = 5, 2, 1
+
+
+class Cut:
+    """A recording in memory, cut into pieces of ``rows``."""
+
+    def __init__(self, data, rows):
+        self.data, self.rows = data, rows
+
+    def __len__(self):
+        return len(self.data)
+
+    def check_range(self, n_states, n_actions):
+        self.data.check_range(n_states, n_actions)
+
+    def chunks(self, multiple=1):
+        pieces = (self.data.where(slice(i, i + self.rows)) for i in range(0, len(self.data), self.rows))
+        return regroup(pieces, multiple)
+
+    def checksum(self):
+        return self.data.checksum()
+
+
+def written(folder, data, kind):
+    """``data`` in a file of each format that needs no plugin, or Parquet."""
+    path = folder / {"npz": "t.npz", "columns": "t", "parquet": "t.parquet"}[kind]
+    if kind == "npz":
+        return data.save(path)
+    if kind == "columns":
+        return save_columns(data, path)
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    pq.write_table(pa.table({n: getattr(data, n) for n in COLUMNS}), path, row_group_size=777, write_page_checksum=True)
+    return path
+
+
+def same(found, expected):
+    """All tables and figures, bit for bit."""
+    for field in fields(expected):
+        x, y = getattr(found, field.name), getattr(expected, field.name)
+        if isinstance(y, torch.Tensor):
+            assert torch.equal(x, y), field.name
+        elif isinstance(y, dict):
+            assert all(np.array_equal(x[k], y[k], equal_nan=True) for k in y), field.name
+        else:
+            assert x == y or (x != x and y != y), field.name
+
+
+OPTIONS = {"s1": {"n_epochs": 2, "n_bias": 2, "beta": 3.0}, "s1_efficient": {"n_epochs": 1, "n_bias": 3, "beta": 3.0}}
+LEARN = {
+    name: learner(**OPTIONS.get(name, {"beta": 3.0, **({} if name == "certainty_equivalence" else {"n_epochs": 2})}))
+    for name, learner in LEARNERS.items()
+    if name != "exact"
+} | {
+    "s1 rescaled often": AlgorithmS1(3.0, n_epochs=2, n_bias=2, rescale_every=13, lr_psi=1.0),
+    "published": EfficientS1.published(3.0, n_epochs=2, n_bias=2),
+    "in logarithms": EfficientS1(3.0, n_epochs=2, n_bias=2, log_domain="on", mean_reward=False),
+}
+
+
+@pytest.mark.parametrize("name", sorted(LEARN))
+def test_learners_do_not_see_how_a_stream_is_cut(name):
+    for data, cuts in ((PLAIN, (1000, 4999)), (NOISY, (1000, 12_999)), (SHORT, (1, 7)), (ENDS, (1000,))):
+        whole = LEARN[name].fit(data, 6, 3)
+        for rows in cuts:
+            same(LEARN[name].fit(Cut(data, rows), 6, 3), whole)
+
+
+@pytest.mark.parametrize("kind", ["npz", "columns", "parquet"])
+def test_files_are_the_stream_in_memory(tmp_path, kind):
+    path = written(tmp_path, NOISY, kind)
+    for rows in (1000, len(NOISY) - 1):
+        found = open_recording(path, 5, 3, chunk=rows)
+        assert isinstance(found, FileRecording)
+        assert (len(found), found.checksum()) == (len(NOISY), NOISY.checksum())
+        assert found.load().checksum() == NOISY.checksum()
+        for name in ("s1", "certainty_equivalence", "s1_efficient", "differential_soft_q"):
+            same(LEARN[name].fit(found, 5, 3), LEARN[name].fit(NOISY, 5, 3))
+    assert isinstance(open_recording(path, 5, 3), Transitions)
+    path = written(tmp_path, SHORT, kind)
+    for rows in (1, 7):
+        found = FileRecording(path, 5, 3, chunk=rows)
+        assert found.checksum() == SHORT.checksum()
+        same(LEARN["s1"].fit(found, 5, 3), LEARN["s1"].fit(SHORT, 5, 3))
+
+
+def test_chunks_are_multiples_and_parts_are_kept_in_memory_only():
+    for rows, multiple in ((1, 5), (7, 5), (100, 7), (3, 1), (40, 100)):
+        chunks = list(Cut(SHORT, rows).chunks(multiple))
+        assert all(len(chunk) % multiple == 0 for chunk in chunks[:-1])
+        assert np.array_equal(np.concatenate([chunk.r for chunk in chunks]), SHORT.r)
+    made = []
+    for data, expected in ((SHORT, 1), (Cut(SHORT, 10), 8)):
+        made.clear()
+        parts = Parts(data, made.append)
+        assert len(list(parts)) == len(list(parts))
+        assert len(made) == expected
+
+
+def test_the_tally_counts():
+    rng = np.random.default_rng(0)
+    n = 30_000  # more distinct (s,a,s') than the tables begin with
+    s, a, s_next = rng.integers(40, size=n), rng.integers(3, size=n), rng.integers(40, size=n)
+    data = Transitions(s, a, rng.standard_normal(n), s_next, 0 * s)
+    found = tally(Cut(data, 1234), 40, 3, 0.5)
+    dense = np.zeros((120, 40))
+    np.add.at(dense, (s * 3 + a, s_next), 1)
+    rows = np.repeat(np.arange(120), np.diff(found.indptr))
+    assert np.array_equal(dense[rows, found.indices], found.counts)
+    assert found.counts.sum() == n
+    assert np.array_equal(found.visits, dense.sum(1))
+    weight = np.zeros((120, 40))
+    for k, j in zip(s * 3 + a, s_next, strict=True):
+        weight[k] *= 0.5
+        weight[k, j] += 0.5
+    np.testing.assert_allclose(found.psi_weight, weight[rows, found.indices], rtol=1e-12)
+    model = empirical_mdp(data, 40, 3)
+    for k in (0, 77):
+        here = data.r[s * 3 + a == k]
+        np.testing.assert_allclose(model.reward.ravel()[k], here.mean(), rtol=1e-12)
+        np.testing.assert_allclose(model.reward_variance.ravel()[k], here.var(ddof=1), rtol=1e-12)
+    with pytest.raises(InputError, match="below 2"):
+        tally(data, 2**30, 3)
+
+
+@pytest.mark.parametrize("kind", ["npz", "columns", "parquet"])
+@pytest.mark.parametrize(
+    ("column", "value", "said"),
+    [
+        ("s", 5, r"s\[3000\]=5: must be a whole number in \[0, 5\)"),
+        ("a_next", -1, r"a_next\[3000\]=-1: must be a whole number in \[0, 3\)"),
+        ("r", np.nan, r"r\[3000\]=nan: must be finite"),
+    ],
+)
+def test_bad_tuples_are_named_or_counted(tmp_path, kind, column, value, said):
+    data = NOISY.where(np.arange(5000))
+    getattr(data, column)[[3000, 4000]] = value
+    path = written(tmp_path, data, kind)
+    with pytest.raises(InputError, match=re.escape(str(path)) + ": " + said):
+        FileRecording(path, 5, 3, chunk=700)
+    found = FileRecording(path, 5, 3, chunk=700, on_bad="skip")
+    good = data.where(np.delete(np.arange(5000), [3000, 4000]))
+    assert (found.n_skipped, len(found), found.checksum()) == (2, 4998, good.checksum())
+    assert found.first_skipped == f"{column}[3000]={value}"
+    same(LEARN["s1"].fit(found, 5, 3), LEARN["s1"].fit(good, 5, 3))
+    assert found.n_skipped == 2
+
+
+def test_missing_values_of_parquet_are_bad_tuples(tmp_path):
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    columns = {name: getattr(SHORT, name).tolist() for name in COLUMNS}
+    columns["s"][5] = columns["r"][7] = None
+    pq.write_table(pa.table(columns), tmp_path / "t.parquet")
+    with pytest.raises(InputError, match=r"s\[5\]=-1"):
+        FileRecording(tmp_path / "t.parquet", 5, 3)
+    assert FileRecording(tmp_path / "t.parquet", 5, 3, on_bad="skip").n_skipped == 2
+
+
+def test_short_and_damaged_columns(tmp_path):
+    path = save_columns(PLAIN, tmp_path / "t")
+    whole = (path / "r.npy").read_bytes()
+    (path / "r.npy").write_bytes(whole[: 128 + 8 * 9000 + 3])
+    with pytest.raises(InputError, match=r"t: r\[9000\]=missing: must be there: 13000 rows are announced"):
+        FileRecording(path, 5, 3)
+    found = FileRecording(path, 5, 3, on_bad="skip", chunk=1000)
+    assert (len(found), found.n_skipped) == (9000, 4000)
+    assert found.checksum() == PLAIN.first(9000).checksum()
+    for content, said in (
+        (whole + b"1", "1 bytes too many"),
+        (whole + whole[-8:], "as long as its header says"),
+        (b"", "readable"),
+        (whole.replace(b"<f8", b"|O8"), "readable"),
+        (whole.replace(b"(13000,)", b"(650,20)"), "shape"),
+        (whole.replace(b"<f8", b"<c8"), "complex"),
+    ):
+        (path / "r.npy").write_bytes(content)
+        with pytest.raises(InputError, match=said):
+            FileRecording(path, 5, 3)
+    (path / "r.npy").unlink()
+    with pytest.raises(InputError, match=r"lacks r\.npy"):
+        FileRecording(path, 5, 3)
+    path = save_columns(PLAIN, tmp_path / "floats")
+    np.save(path / "s.npy", PLAIN.s.astype(float))
+    with pytest.raises(InputError, match="s=dtype float64: must be a column of whole numbers"):
+        FileRecording(path, 5, 3, on_bad="skip")
+
+
+def test_refusals(tmp_path):
+    with pytest.raises(InputError, match=r"none\.npz: must be an npz or Parquet file"):
+        open_recording(tmp_path / "none.npz", 5, 3)
+    path = written(tmp_path, PLAIN, "npz")
+    with pytest.raises(InputError, match="on_bad=ignore"):
+        open_recording(path, 5, 3, on_bad="ignore")
+    with pytest.raises(InputError, match="chunk=0"):
+        open_recording(path, 5, 3, chunk=0)
+    with pytest.raises(InputError, match="0 good tuples"):
+        open_recording(written(tmp_path, Transitions([9], [9], [0.0], [9], [9]), "columns"), 5, 3, on_bad="skip")
+    found = FileRecording(path, 5, 3, chunk=1000)
+    with pytest.raises(InputError, match="those it was opened with"):
+        CertaintyEquivalence().fit(found, 4, 3)
+    with pytest.raises(InputError, match="implementation=literal"):
+        AlgorithmS1(implementation="literal").fit(found, 5, 3)
+    with pytest.raises(InputError, match="in memory"):
+        Replicas.of(AlgorithmS1(), beta=[1.0, 2.0]).fit(found, 5, 3)
+    PLAIN.first(500).save(path)
+    with pytest.raises(InputError, match="500 tuples: must be left as it was"):
+        AlgorithmS1().fit(found, 5, 3)
+
+
+def test_a_failure_names_its_tuple_wherever_it_is_read_from():
+    data = Transitions(PLAIN.s, PLAIN.a, PLAIN.r.copy(), PLAIN.s_next, PLAIN.a_next)
+    data.r[7777:] -= 300.0
+    found = [AlgorithmS1(10.0, lr_u=0.9).fit(d, 5, 3) for d in (data, Cut(data, 999))]
+    assert "at tuple" in found[0].message
+    same(found[1], found[0])
+
+
+def test_columns_are_written_whole_or_not_at_all(tmp_path):
+    path = tmp_path / "deep" / "t"
+
+    def interrupted():
+        with ColumnWriter(path) as writer:
+            writer.append(PLAIN)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert list((tmp_path / "deep").iterdir()) == []
+    assert record(MDP, path, 13, 1000, 1) == path
+    assert open_recording(path, 5, 3).checksum() == PLAIN.checksum()
+    assert np.array_equal(np.load(path / "s_next.npy", mmap_mode="r"), PLAIN.s_next)
+    save_columns(SHORT, path)  # replaced
+    assert len(open_recording(path, 5, 3)) == 40
+    assert [p.name for p in (tmp_path / "deep").iterdir()] == ["t"]
+    (path / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match="must be new, empty, or one of columns"):
+        save_columns(SHORT, path)
+    assert (path / "notes.txt").exists()
+
+
+def test_recording_moves_the_generators_as_collecting_does(tmp_path):
+    behaviour = np.full((5, 3), 1 / 3)
+    draws = []
+    for work in (collect, lambda source, *rest: record(source, tmp_path / "t", *rest)):
+        rng = streams(3)
+        work(MDP, 4, 250, rng, behaviour)
+        draws.append([generator.random() for generator in rng])
+    assert draws[0] == draws[1]
+    assert open_recording(tmp_path / "t", 5, 3).checksum() == collect(MDP, 4, 250, 3, behaviour).checksum()
+
+
+@pytest.mark.parametrize("vector", [False, True])
+def test_environments_are_recorded_piece_by_piece(tmp_path, vector):
+    made = [gym.make_vec("FrozenLake-v1", 3) if vector else gym.make("FrozenLake-v1") for _ in range(2)]
+    reported = []
+    record(made[0], tmp_path / "t", 220 if vector else 1600, 50, 0, report=reported.append)
+    data = collect(made[1], 220 if vector else 1600, 50, 0)
+    assert len(data) > 10_000
+    assert len(reported) > 1
+    assert reported[-1] == len(data)
+    assert open_recording(tmp_path / "t", 16, 4).checksum() == data.checksum()
+
+
+def damaged(rng, folder, kind):
+    """A file in which something is wrong."""
+    data = NOISY.first(200)
+    path = written(folder, data, kind)
+    damage = rng.choice(["cut", "flip", "type", "name", "zero", "longer"])
+    file = path / f"{rng.choice(COLUMNS)}.npy" if kind == "columns" else path
+    content = bytearray(file.read_bytes())
+    if damage == "cut":
+        content = content[: rng.integers(len(content))]
+    elif damage == "flip":
+        for at in rng.integers(len(content), size=rng.integers(1, 4)):
+            content[at] ^= 1 << int(rng.integers(8))
+    elif damage == "zero":
+        at = int(rng.integers(len(content)))
+        content[at : at + 64] = bytes(len(content[at : at + 64]))
+    elif damage == "longer":
+        content += bytes(rng.integers(256, size=int(rng.integers(1, 200)), dtype=np.uint8))
+    else:
+        columns = {name: getattr(data, name) for name in COLUMNS}
+        name = str(rng.choice(COLUMNS))
+        wrong = rng.choice(["<U3", "f4", "c16", "u8", "i1", "?", "O", "M8[s]", "2d"])
+        column = columns.pop(name)
+        columns[name if damage == "type" else "S"] = column.reshape(-1, 2) if wrong == "2d" else column.astype(wrong)
+        if kind == "columns":
+            (path / f"{name}.npy").unlink()
+            for key, value in columns.items():
+                np.save(path / f"{key}.npy", value)
+        elif kind == "npz":
+            np.savez(path, **columns)
+        else:
+            import pyarrow as pa
+            import pyarrow.parquet as pq
+
+            with contextlib.suppress(pa.ArrowException):  # what it cannot write needs no reading
+                pq.write_table(pa.table({k: pa.array(list(v)) for k, v in columns.items()}), path)
+        return path
+    file.write_bytes(content)
+    return path
+
+
+def refusal(path, on_bad):
+    """What is said of a file that is refused; "" if learning from it runs."""
+    with contextlib.redirect_stderr(io.StringIO()) as said:
+        try:
+            CertaintyEquivalence().fit(open_recording(path, 5, 3, on_bad=on_bad, chunk=64), 5, 3)
+        except InputError as error:
+            return str(error)
+        finally:
+            assert said.getvalue() == ""
+    return ""
+
+
+@pytest.mark.parametrize("kind", ["npz", "columns", "parquet"])
+def test_damaged_files_run_or_say_why(tmp_path, kind):
+    rng = np.random.default_rng(0)
+    said = []
+    for i in range(40):
+        folder = tmp_path / str(i)
+        folder.mkdir()
+        said.append(refusal(damaged(rng, folder, kind), str(rng.choice(["stop", "skip"]))))
+        assert "\n" not in said[-1]
+    assert sum(map(bool, said)) > 10
+
+
+def test_command_line(tmp_path, typed_here):
+    options = ["learner.n_epochs=2", "learner.n_bias=1", "evaluation.pictures=false", "evaluation.certify=false"]
+    simulated = [*options, "experience.n_episodes=20", "experience.episode_length=100"]
+    code, _, error = typed_here("train.py", *simulated, "experience.save_to=t/", "hydra.run.dir=a")
+    assert code == 0, error
+    recorded = [*options, "experience=recorded", "experience.path=t"]
+    code, _, error = typed_here("train.py", *recorded, "experience.chunk=100", "hydra.run.dir=b")
+    assert code == 0, error
+    results = [json.loads((tmp_path / name / "result.json").read_text()) for name in "ab"]
+    assert len({(r["theta"], r["rho"], r["n_tuples"]) for r in results}) == 1
+    s = np.load(tmp_path / "t" / "s.npy")
+    s[[3, 9]] = 77
+    np.save(tmp_path / "t" / "s.npy", s)
+    code, _, error = typed_here("train.py", *recorded, "hydra.run.dir=d")
+    assert (code, error) == (1, "error: experience.path=t: s[3]=77: must be a whole number in [0, 15)\n")
+    code, _, error = typed_here("train.py", *recorded, "experience.on_bad=skip", "hydra.run.dir=e")
+    assert code == 0, error
+    assert "note: t: 2 bad tuples of 2,000 left out; the first is s[3]=77\n" in error
+    assert json.loads((tmp_path / "e" / "result.json").read_text())["n_skipped"] == 2
+
+
+# -- Minari ------------------------------------------------------------------------------------------------
+
+
+class Episode:
+    def __init__(self, observations, actions, rewards, terminated, truncated=False):
+        self.observations, self.actions = np.array(observations), np.array(actions)
+        self.rewards = np.array(rewards, float)
+        n = len(actions)
+        self.terminations = np.array([False] * (n - 1) + [terminated])
+        self.truncations = np.array([False] * (n - 1) + [truncated])
+
+
+EPISODES = [
+    Episode([0, 1, 4], [2, 1], [-1, 0], True),
+    Episode([2, 3, 2], [0, 1], [-1, -1], False, True),
+    Episode([3, 1, 4], [1, 2], [-1, 0], True),
+]
+
+
+def test_minari_episodes_become_tuples(tmp_path, monkeypatch):
+    import minari
+    from minari.data_collector import EpisodeBuffer
+
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    buffers = [
+        EpisodeBuffer(i, None, None, list(e.observations), list(e.actions), list(e.rewards), list(e.terminations),
+                      list(e.truncations), None)
+        for i, e in enumerate(EPISODES)
+    ]  # fmt: skip
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # Minari's own, of what a data set should say of itself
+        minari.create_dataset_from_buffers(
+            "erl/test-v0",
+            buffers,
+            observation_space=gym.spaces.Discrete(5),
+            action_space=gym.spaces.Discrete(3),
+            eval_env=None,
+            **dict.fromkeys(("description", "algorithm_name", "author", "author_email", "code_permalink"), "x"),
+        )
+    prior = np.array([[0.5, 0.25, 0.25]] * 5)
+    found = {
+        rows: open_recording("minari:erl/test-v0", 5, 3, on_prior=True, prior_policy=prior, chunk=rows, seed=5)
+        for rows in (1, 2, 100)
+    }
+    data = found[100]
+    # Terminated: on to the next episode, the last to the first. Truncated: to the state reached.
+    assert data.s.tolist() == [0, 1, 2, 3, 3, 1]
+    assert data.a.tolist() == [2, 1, 0, 1, 1, 2]
+    assert data.s_next.tolist() == [1, 2, 3, 2, 1, 0]
+    assert data.r.tolist() == [-1, 0, -1, -1, -1, 0]
+    x = streams(5).behaviour.random(6)
+    drawn = (np.cumsum(prior[0]) <= x[:, None]).sum(1)
+    assert data.a_next.tolist() == [1, 0, 1, drawn[3], 2, 2]
+    assert {found[rows].checksum() for rows in found} == {data.checksum()}
+    other = open_recording("minari:erl/test-v0", 5, 3, prior_policy=prior, seed=5)
+    assert np.array_equal(other.a_next, drawn)
+    with pytest.raises(InputError, match=r"s\[0\]|s_next\[1\]|in \[0, 2\)"):
+        open_recording("minari:erl/test-v0", 2, 3)
+    with pytest.raises(InputError, match="none-v0: must be a readable Minari data set"):
+        open_recording("minari:erl/none-v0", 5, 3)
