@@ -18,7 +18,7 @@ import numpy as np
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 ROOT = Path(__file__).parents[1]
-RUN = ["learner.n_epochs=1000", "evaluation.pictures=false", "checkpoint_every=0", "experience.n_episodes=200"]
+RUN = ["learner.n_epochs=2000", "evaluation.pictures=false", "checkpoint_every=0", "experience.n_episodes=200"]
 
 
 def start(directory: Path) -> subprocess.Popen[bytes]:
@@ -49,7 +49,7 @@ def main(kills: int = 100, seed: int = 0) -> None:
         assert process.wait() == 0
         alone = time.perf_counter() - tick
         # From before the first import to well into the learning.
-        longest = first + min(2.0, (alone - first) / kills * 4)
+        longest = first + min(1.0, (alone - first) / kills * 4)
         done = 0
         while done < kills:
             process = start(cut)
