@@ -8,6 +8,7 @@ is passed over.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import io
 import json
@@ -15,7 +16,7 @@ import math
 import shutil
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ import numpy as np
 import torch
 
 from erl_torch.checks import InputError
+from erl_torch.event_file import PATTERN
 from erl_torch.files import write_bytes, write_json
 from erl_torch.learners import states
 
@@ -71,6 +73,18 @@ class Checkpoints:
                 continue
             return found
         return None
+
+    @contextlib.contextmanager
+    def refusing(self, learnt: Callable[[], bool]) -> Iterator[None]:
+        """Bad input that shows before anything is ``learnt`` leaves nothing behind."""
+        try:
+            yield
+        except InputError:
+            if not learnt():
+                for path in (self.directory / "settings.json", *self.directory.glob(PATTERN)):
+                    path.unlink(missing_ok=True)
+                self.clear()
+            raise
 
     def result(self) -> dict[str, Any] | None:
         """What the run came to, if it is complete."""

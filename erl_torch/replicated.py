@@ -132,7 +132,8 @@ def train_replicas(cfg: DictConfig, directory: Path, safe_point: SafePoint, save
             began -= found["seconds"]
         logged = [*learners[0].init(n_states, n_actions).metrics(), *first]
         boards = replica_layout({g.name: known for g, known in zip(groups[:MOST_LOGGED], exact, strict=False)}, logged)
-        with Board(directory, settings, boards, found["events"] if found else 0) as board:
+        size = found["events"] if found else 0
+        with saved.refusing(lambda: bool(history)), Board(directory, settings, boards, size) as board:
             if not found:
                 board.texts(cfg)
                 record.add(0, first, board)

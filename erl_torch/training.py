@@ -126,7 +126,8 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
         lines = evaluation_tags(first, "prior") | _optimal_tags(best, judge, episode, horizon) | _data_tags(estimate)
         boards = layout([*run.names(start), *evaluation_tags(first)], lines)
         settings = hyperparameters(cfg, n_experience=run.n_experience)
-        with Board(directory, settings, boards, found["events"] if found else 0) as board:
+        size = found["events"] if found else 0
+        with saved.refusing(lambda: bool(history)), Board(directory, settings, boards, size) as board:
             board.lines(lines)
             drawer = _Drawer(board, getattr(env.unwrapped, "grid", None)) if cfg.evaluation.pictures else None
             if not found:

@@ -251,3 +251,12 @@ def test_damaged_settings_are_named(tmp_path):
     with pytest.raises(InputError, match=r"settings=.*settings\.json: must be readable JSON"):
         train(composed(*SMALL), tmp_path)
     assert json.dumps(sorted(p.name for p in Path(tmp_path).iterdir())) == '["settings.json"]'
+
+
+@pytest.mark.parametrize("replicas", [(), ("n_replicas=2",)])
+def test_input_that_shows_as_bad_once_learning_begins_leaves_nothing(tmp_path, replicas):
+    one = ("experience.n_episodes=1", "experience.episode_length=1")
+    cfg = composed("learner=certainty_equivalence", *one, *replicas)
+    with pytest.raises(InputError, match="transitions=a stream that never returns to any state"):
+        train(cfg, tmp_path)
+    assert not any(tmp_path.iterdir())

@@ -82,7 +82,10 @@ class GridWorld:
             raise InputError("wind", "array", "finite angles and strengths in [0, 1]")
         if self.n_actions not in ACTIONS:
             raise InputError("n_actions", self.n_actions, " or ".join(map(str, ACTIONS)))
-        success = np.asarray(self.action_success_prob, dtype=np.float64)
+        success = np.asarray(self.action_success_prob)
+        if success.dtype.kind not in "iuf":
+            allowed = f"one number in [0, 1], or {self.n_actions} of them"
+            raise InputError("action_success_prob", self.action_success_prob, allowed)
         if success.shape not in ((), (self.n_actions,)) or not ((success >= 0) & (success <= 1)).all():
             raise InputError(
                 "action_success_prob", success.tolist(), f"one number in [0, 1], or {self.n_actions} of them"
@@ -95,7 +98,7 @@ class GridWorld:
                 raise InputError(key, reward, "a finite number")
         object.__setattr__(self, "desc", rows)
         object.__setattr__(self, "wind", wind)
-        object.__setattr__(self, "action_success_prob", np.broadcast_to(success, self.n_actions))
+        object.__setattr__(self, "action_success_prob", np.broadcast_to(success.astype(np.float64), self.n_actions))
 
     @property
     def shape(self) -> tuple[int, int]:

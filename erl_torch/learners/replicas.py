@@ -41,6 +41,7 @@ from erl_torch.transitions import Transitions
 
 KEEP_BYTES = 1 << 30  # of tuples kept by default
 TUPLE_BYTES = 8  # a tuple in the interleaved loop
+STREAM_BYTES = 40  # a tuple in the prepared stream of a learner that does not say: columns and pairs
 
 
 @dataclass(frozen=True, eq=False)
@@ -331,7 +332,7 @@ def each(
     """``Replicas.iterate`` of any learner that streams. Prepared streams are held where they fit, else made again."""
     learners, prior = replicas.learners, replicas.prior_policy(n_states, n_actions)
     held: list[Any] = [None] * len(replicas)
-    hold = fits(experience, len(replicas), learners[0].stream_bytes)
+    hold = fits(experience, len(replicas), getattr(learners[0], "stream_bytes", STREAM_BYTES))
     states = list(state.states) if state else [learner.init(n_states, n_actions) for learner in learners]
     failures = dict(state.failures) if state else {}
 
