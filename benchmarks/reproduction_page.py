@@ -37,8 +37,8 @@ Verdicts: *reproduced* (equal to the digits given), *reproduced in distribution*
 lies where one more of our replicas would), *not reproduced*. Values marked \u2020 are not in the paper: they were
 computed independently of this package, to high precision or on other samples.
 
-Wall clock on two cores of a shared server (2026-11-25): `table_s1 scale=full` 2 min 28 s, `table_s2 scale=full` with its
-sampling 2 min 44 s, all other artifacts at full scale together 56 s, `artifact=all scale=quick` 37 s.
+Wall clock on two cores of a shared server (2026-11-25): `table_s1 scale=full` 2 min 28 s, `table_s2 scale=full` with
+its sampling 2 min 44 s, all other artifacts at full scale together 56 s, `artifact=all scale=quick` 37 s.
 
 
 """
