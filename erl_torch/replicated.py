@@ -10,6 +10,7 @@ run that ``train.py`` makes of that seed alone, bit for bit.
 from __future__ import annotations
 
 import contextlib
+import functools
 import itertools
 import os
 import sys
@@ -48,7 +49,6 @@ from erl_torch.training import (
     make_env,
     make_learner,
     make_world,
-    mean_return,
     recorded,
     versions,
     where,
@@ -349,6 +349,18 @@ class _Judges:
         for rng, state in zip(self.rngs, states, strict=True):
             rng.bit_generator.state = state
 
+    @functools.cached_property
+    def of_model(self) -> Judge:
+        """Of the model that there is."""
+        assert self.model is not None
+        return Judge(self.model, self.prior, self.horizon)
+
+    @functools.cached_property
+    def of_episode(self) -> Judge:
+        """Of the episodes' model that there is."""
+        assert self.episode is not None
+        return self.of_model if self.episode is self.model else Judge(self.episode, self.prior, self.horizon)
+
     def __call__(self, policies: np.ndarray, milestone: bool) -> dict[str, np.ndarray]:
         """Figures of policies [R, S, A], [R] each."""
         found: dict[str, np.ndarray] = {}
@@ -358,15 +370,13 @@ class _Judges:
                 return np.array(list(pool.map(figure, range(len(policies)))))
 
         if self.model is not None:
-            judge = Judge(self.model, self.prior, self.horizon)
-            found["reward_per_step"] = each(lambda r: judge.reward_per_step(policies[r]))
-            found["objective"] = each(lambda r: judge.objective(policies[r], self.betas[r]))
+            found["reward_per_step"] = each(lambda r: self.of_model.reward_per_step(policies[r]))
+            found["objective"] = each(lambda r: self.of_model.objective(policies[r], self.betas[r]))
         if self.episode is not None:
             if self.episode is self.model:
                 found["return"] = self.horizon * found["reward_per_step"]
             else:
-                judge_of_episode = Judge(self.episode, self.prior, self.horizon)
-                found["return"] = self.horizon * each(lambda r: judge_of_episode.reward_per_step(policies[r]))
+                found["return"] = self.horizon * each(lambda r: self.of_episode.reward_per_step(policies[r]))
         elif milestone:
             played = [
                 evaluate(self.env, policy, beta, rng, self.n_episodes, self.horizon, self.prior)
@@ -384,7 +394,6 @@ def _exact(cfg: DictConfig, judges: _Judges, groups: list[Group]) -> list[dict[s
     model = judges.model
     if model is None or not cfg.evaluation.certify or model.n_states > SMALL:
         return [{} for _ in groups]
-    judge = Judge(model, judges.prior, judges.horizon)
     known: dict[float, dict[str, float]] = {}
     for beta in {group.beta for group in groups}:
         best = solve_soft_bellman(model, beta, judges.prior)
@@ -392,9 +401,9 @@ def _exact(cfg: DictConfig, judges: _Judges, groups: list[Group]) -> list[dict[s
         if best.status is Status.CONVERGED and best.theta is not None:
             policy = best.policy.numpy()
             known[beta] = {"theta": best.theta, "delta_max": best.reward_bias_max, "objective": -best.theta}
-            known[beta]["reward_per_step"] = judge.reward_per_step(policy)
+            known[beta]["reward_per_step"] = judges.of_model.reward_per_step(policy)
             if judges.episode is not None:
-                known[beta]["return"] = mean_return(judges.episode, judges.horizon, policy)
+                known[beta]["return"] = judges.horizon * judges.of_episode.reward_per_step(policy)
     return [known[group.beta] for group in groups]
 
 
