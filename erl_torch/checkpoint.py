@@ -16,7 +16,7 @@ import math
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -122,13 +122,8 @@ class Checkpoints:
             raise InputError("hydra.run.dir", self.directory, allowed)
 
 
-def columns(rows: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
-    """A history of rows with the same names, as one array a name: a thousand times fewer objects to write."""
-    return {name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())}
-
-
 def rows_of(found: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
-    """What ``columns`` was given: numbers as numbers, arrays as arrays."""
+    """What ``fitting.columns`` was given: numbers as numbers, arrays as arrays."""
     n = max((len(column) for column in found.values()), default=0)
     plain = {name: column.tolist() if column.ndim == 1 else list(column) for name, column in found.items()}
     return [{name: column[i] for name, column in plain.items()} for i in range(n)]

@@ -28,12 +28,13 @@ from tqdm import tqdm
 
 from erl_torch import checks, pictures
 from erl_torch.board import Board, hyperparameters, replica_layout
-from erl_torch.checkpoint import Checkpoints, columns, rows_of
+from erl_torch.checkpoint import Checkpoints, rows_of
 from erl_torch.checks import InputError
 from erl_torch.evaluation import Judge, evaluate
 from erl_torch.experience import collect
 from erl_torch.files import read_npy, write_json, write_png
 from erl_torch.learners import Exact, NonFiniteError
+from erl_torch.learners.fitting import columns
 from erl_torch.learners.replicas import KEEP_BYTES, Experience, Replicas, ReplicaSolution, Simulation
 from erl_torch.mdp import TabularMDP
 from erl_torch.models import known_mdp, sizes

@@ -26,7 +26,7 @@ import erl_torch
 from erl_torch import checks, kernels, pictures
 from erl_torch.board import Board, hyperparameters, layout
 from erl_torch.chains import SingularChainError
-from erl_torch.checkpoint import Checkpoints, columns, rows_of
+from erl_torch.checkpoint import Checkpoints, rows_of
 from erl_torch.checks import InputError
 from erl_torch.config import check_keys
 from erl_torch.empirical import empirical_mdp
@@ -37,6 +37,7 @@ from erl_torch.evaluation import Evaluation, evaluate, reward_per_step
 from erl_torch.experience import collect, record
 from erl_torch.files import read_npy, write_json
 from erl_torch.learners import LEARNERS, Exact, ExactState, NonFiniteError, S1State
+from erl_torch.learners.fitting import columns
 from erl_torch.mdp import TabularMDP, check_policy
 from erl_torch.models import MeanRewardWarning, absorbing, known_mdp, sizes, tabular_mdp
 from erl_torch.recordings import FileRecording, open_recording

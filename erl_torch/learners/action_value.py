@@ -39,7 +39,7 @@ import torch
 
 from erl_torch import checks, kernels
 from erl_torch.checks import InputError
-from erl_torch.learners.fitting import NonFiniteError, epochs, run_to_end
+from erl_torch.learners.fitting import NonFiniteError, columns, epochs, run_to_end
 from erl_torch.mdp import check_policy
 from erl_torch.solution import Solution, Status
 from erl_torch.transitions import Parts, Recording, Transitions
@@ -155,7 +155,6 @@ class ActionValueLearner:
     ) -> Solution:
         """The solution that ``state`` stands for; ``history`` holds one ``metrics()`` a pass."""
         ended = Status.COMPLETED if self.finished(state) else Status.STOPPED
-        rows = history or []
         return Solution.of_action_values(
             state.action_value,
             state.prior_policy,
@@ -164,7 +163,7 @@ class ActionValueLearner:
             n_steps=state.n_tuples,
             status=ended if failure is None else Status.NON_FINITE,
             message=str(failure) if failure else "",
-            history={name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else {})},
+            history=columns(history or []),
         )
 
     def init(self, n_states: int, n_actions: int) -> ActionValueState:

@@ -73,7 +73,7 @@ from erl_torch import checks, kernels
 from erl_torch.checks import InputError
 from erl_torch.empirical import tally
 from erl_torch.learners import listing
-from erl_torch.learners.fitting import NonFiniteError, epochs, run_to_end
+from erl_torch.learners.fitting import NonFiniteError, columns, epochs, run_to_end
 from erl_torch.mdp import check_policy
 from erl_torch.solution import Solution, Status
 from erl_torch.transitions import Parts, Recording, Transitions, tuple_at
@@ -271,7 +271,6 @@ class AlgorithmS1:
             status = Status.STOPPED
         else:
             status = Status.COMPLETED if state.psi_converged else Status.PSI_LIMIT
-        rows = history or []
         return Solution(
             policy=state.policy,
             u=state.u,
@@ -284,7 +283,7 @@ class AlgorithmS1:
             status=status,
             message=str(failure) if failure else "",
             beta=self.beta,
-            history={name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else {})},
+            history=columns(history or []),
         )
 
     # -- its parts, for callers that keep the state themselves --------------------------------------

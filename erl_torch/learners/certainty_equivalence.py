@@ -19,7 +19,7 @@ import torch
 
 from erl_torch import checks
 from erl_torch.empirical import EmpiricalMDP, EmpiricalProblem, empirical_mdp
-from erl_torch.learners.fitting import epochs
+from erl_torch.learners.fitting import columns, epochs
 from erl_torch.mdp import check_policy
 from erl_torch.solution import Solution, Status
 from erl_torch.solvers.soft_bellman import solve_problem
@@ -159,7 +159,6 @@ class CertaintyEquivalence:
         failure: ArithmeticError | None = None,
     ) -> Solution:
         """The solution that ``state`` stands for; ``history`` holds one ``metrics()``."""
-        rows = history or []
         answer = state.answer or Solution(
             policy=state.policy,
             u=state.u,
@@ -173,4 +172,4 @@ class CertaintyEquivalence:
             message=str(failure or ""),
             beta=self.beta,
         )
-        return replace(answer, history={name: np.array([row[name] for row in rows]) for name in (rows or [{}])[0]})
+        return replace(answer, history=columns(history or []))

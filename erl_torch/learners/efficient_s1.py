@@ -72,7 +72,7 @@ from erl_torch.checks import InputError
 from erl_torch.empirical import EmpiricalMDP, EmpiricalProblem, empirical_mdp, tally
 from erl_torch.evaluation import kl_per_state
 from erl_torch.learners.algorithm_s1 import BLOCK, LOG_PSI_EPSILON
-from erl_torch.learners.fitting import NonFiniteError, epochs, run_to_end
+from erl_torch.learners.fitting import NonFiniteError, columns, epochs, run_to_end
 from erl_torch.mdp import check_policy
 from erl_torch.solution import Solution, Status
 from erl_torch.solvers.problem import soft_backup
@@ -287,7 +287,6 @@ class EfficientS1:
             status = Status.STOPPED
         else:
             status = Status.COMPLETED if state.psi_converged else Status.PSI_LIMIT
-        rows = history or []
         return Solution(
             policy=state.policy,
             u=state.u,
@@ -300,7 +299,7 @@ class EfficientS1:
             status=status,
             message=str(failure) if failure else "",
             beta=self.beta,
-            history={name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else {})},
+            history=columns(history or []),
         )
 
     def online(self, chunks: Iterable[Transitions], n_states: int, n_actions: int) -> Iterator[EfficientState]:

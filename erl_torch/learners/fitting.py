@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
+
+import numpy as np
 
 from erl_torch.solution import Solution
 from erl_torch.transitions import Recording
@@ -30,6 +32,11 @@ def epochs(learner: Any, transitions: Recording, n_states: int, n_actions: int, 
     while not learner.finished(state):
         state = learner.step(state, stream)
         yield state
+
+
+def columns(rows: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
+    """Rows of numbers (or arrays) with the same names, as one array a name."""
+    return {name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())}
 
 
 def run_to_end(learner: Any, transitions: Recording, n_states: int, n_actions: int) -> Solution:

@@ -34,7 +34,7 @@ from erl_torch.checks import InputError
 from erl_torch.experience import collect
 from erl_torch.files import read_npz, write_npz
 from erl_torch.learners.algorithm_s1 import AlgorithmS1
-from erl_torch.learners.fitting import NonFiniteError
+from erl_torch.learners.fitting import NonFiniteError, columns
 from erl_torch.mdp import TabularMDP, check_policy
 from erl_torch.solution import Solution
 from erl_torch.transitions import Transitions
@@ -322,8 +322,7 @@ class EachState:
         return self.states[r]
 
     def metrics(self) -> dict[str, np.ndarray]:
-        rows = [state.metrics() for state in self.states]
-        return {name: np.array([row[name] for row in rows]) for name in rows[0]}
+        return columns([state.metrics() for state in self.states])
 
 
 def each(
