@@ -1,17 +1,33 @@
-"""Markov chains: classes of states, and linear equations solved by regeneration.
+"""Markov chains: classes of states, shares of time, and linear equations solved by regeneration.
 
 A chain K [S, S] with a state ``ref`` that is reached from everywhere is cut at its visits to ``ref``: with A = I - K
 without the row and column of ``ref``, both the Poisson equation and the stationary distribution are solves with the
-sparse LU of A, a nonsingular M-matrix (stable without pivoting), and no dense column spoils its sparsity where many
-states restart at ``ref``.
+LU of A, a nonsingular M-matrix (stable without pivoting), and no dense column spoils its sparsity where many states
+restart at ``ref``.
+
+The diagonal of A is never a difference: it is the sum of the rest of its row, and so is every pivot (Grassmann,
+Taksar, Heyman 1985), as long as the factors stay small enough for the compiled elimination. Beyond that SuperLU
+factors A; its pivots are differences, and states that are all but closed cost digits there.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.csgraph as csgraph
 import scipy.sparse.linalg as spla
+
+from erl_torch import kernels
+
+GTH_STATES = 100  # up to here the dense elimination is the faster
+DENSE_STATES = 2000  # up to here it is done where nothing else will do: seconds, 32 MB
+SPARSE_STATES = 4000
+EPSILON = float(np.finfo(np.float64).eps)
+MAX_OPERATIONS = 15_000_000  # multiplications of one compiled LU: some ten milliseconds
 
 
 class SingularChainError(ArithmeticError):
@@ -50,25 +66,88 @@ def likely_state(chain: sp.csr_array, steps: int = 64) -> int:
     return int(np.argmax(share))
 
 
-class RegenerativeLU:
-    """Sparse LU of I - discount * ``chain``, cut at ``ref``; ``chain`` is a row-stochastic CSR [S, S].
+@dataclass(frozen=True, eq=False)
+class Elimination:
+    """An order in which to eliminate the states of chains of one pattern, and the fill of their LU factors."""
 
-    With discount 1, raises SingularChainError if ``ref`` is not reached from everywhere.
-    """
+    ptr: np.ndarray  # [n + 1], CSR of the pattern
+    ind: np.ndarray
+    rank: np.ndarray  # [n], place in the elimination; empty where the chains are too large or fill too much
+    lu: tuple[np.ndarray, ...]  # (lptr, lind, uptr, uind) of ``kernels.lu_pattern``; likewise
 
-    def __init__(self, chain: sp.csr_array, ref: int, discount: float = 1.0) -> None:
+    @classmethod
+    def of(cls, ptr: np.ndarray, ind: np.ndarray) -> Elimination:
+        """For CSR chains (ptr, ind)."""
+        n = len(ptr) - 1
+        too_large = cls(ptr, ind, np.empty(0, np.int32), ())
+        if n > SPARSE_STATES:
+            return too_large
+        # Any values will do: SuperLU is asked for its minimum-degree ordering alone.
+        some = 2 * sp.eye_array(n) - sp.csr_array((np.full(ind.size, 1.0 / n), ind, ptr), shape=(n, n))
+        ordered = spla.splu(
+            some.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+        )
+        rank = ordered.perm_c.astype(np.int32)
+        ptr, ind = ptr.astype(np.int64), ind.astype(np.int32)
+        lu = kernels.lu_pattern(ptr, ind, rank)
+        return too_large if (np.diff(lu[2]) ** 2).sum() > MAX_OPERATIONS else cls(ptr, ind, rank, lu)
+
+    @property
+    def fits(self) -> bool:
+        return bool(self.lu)
+
+    @cached_property
+    def order(self) -> np.ndarray:
+        """The states as they are eliminated, [n]."""
+        return np.argsort(self.rank)
+
+    @cached_property
+    def column(self) -> np.ndarray:
+        """Rank of the successor, entry by entry."""
+        return self.rank[self.ind]
+
+
+class _CompiledLU:
+    """LU of I - K, cut at ``ref``, without a subtraction; ``data`` are K's entries on the elimination's pattern."""
+
+    def __init__(self, elimination: Elimination, data: np.ndarray, ref: int, leak: float) -> None:
+        e, n = elimination, len(elimination.rank)
+        lptr, lind, uptr, uind = e.lu
+        low, up, diagonal = np.empty(lind.size), np.empty(uind.size), np.empty(n)
+        at = int(e.rank[ref])
+        kernels.cut_lu(
+            e.ptr, e.column, data, e.order, at, leak, lptr, lind, uptr, uind, low, up, diagonal, np.empty(n), np.zeros(n)
+        )
+        self._elimination, self._data, self._ref = e, data, at
+        self._factors = (lptr, lind, uptr, uind, low, up, diagonal)
+
+    def solve(self, x: np.ndarray) -> np.ndarray:
+        ranked = x[self._elimination.order]
+        kernels.cut_solve(*self._factors, ranked)
+        return ranked[self._elimination.rank]
+
+    def visits(self) -> np.ndarray:
+        """Expected visits to each state between two to ``ref``, [n]."""
+        e = self._elimination
+        ranked = np.empty(len(e.rank))
+        kernels.cut_share(e.ptr, e.column, self._data, e.order, self._ref, *self._factors, ranked)
+        return ranked[e.rank]
+
+
+class _SuperLU:
+    """The same by SuperLU, for factors that are large."""
+
+    def __init__(self, chain: sp.csr_array, ref: int, leak: float, row: np.ndarray) -> None:
         n = chain.shape[0]
-        self.ref, self.discount = ref, discount
-        self.chain = chain if discount == 1.0 else chain * discount
-        first, last = chain.indptr[ref], chain.indptr[ref + 1]
-        self._row = np.zeros(n)  # of ref, without ref itself
-        np.add.at(self._row, chain.indices[first:last], self.chain.data[first:last])
-        self._row[ref] = 0.0
-        data = -self.chain.data
-        data[chain.indices == ref] = 0.0
-        data[first:last] = 0.0
-        cut = sp.csc_array(sp.csr_array((data, chain.indices, chain.indptr), shape=(n, n)) + sp.eye_array(n))
-        cut.eliminate_zeros()
+        origin = np.repeat(np.arange(n), np.diff(chain.indptr))
+        away = chain.indices != origin
+        diagonal = np.bincount(origin[away], chain.data[away], n) + leak
+        diagonal[ref] = 1.0
+        if not (diagonal > 0).all():  # SuperLU reads outside its arrays where a diagonal entry is missing
+            raise SingularChainError(f"state {int(np.argmin(diagonal))} is never left")
+        kept = away & (chain.indices != ref) & (origin != ref)
+        off = sp.csr_array((-chain.data[kept], (origin[kept], chain.indices[kept])), shape=(n, n))
+        cut = sp.csc_array(off + sp.diags_array(diagonal))
         try:
             # No pivoting: an M-matrix needs none, and the fill stays what the ordering makes it.
             self._lu = spla.splu(
@@ -76,17 +155,53 @@ class RegenerativeLU:
             )
         except RuntimeError as error:  # exactly singular
             raise SingularChainError(str(error)) from error
+        self._ref, self._row = ref, row
+
+    def solve(self, x: np.ndarray) -> np.ndarray:
+        return np.asarray(self._lu.solve(x))
+
+    def visits(self) -> np.ndarray:
+        found = np.maximum(self._lu.solve(self._row, "T"), 0.0)
+        found[self._ref] = 1.0
+        return np.asarray(found)
+
+
+class RegenerativeLU:
+    """LU of I - discount * ``chain``, cut at ``ref``; ``chain`` is a row-stochastic CSR [S, S].
+
+    ``elimination``: of the chain's pattern, where it is known already. With discount 1, raises SingularChainError if
+    ``ref`` is not reached from everywhere.
+    """
+
+    def __init__(
+        self, chain: sp.csr_array, ref: int, discount: float = 1.0, elimination: Elimination | None = None
+    ) -> None:
+        n = chain.shape[0]
+        self.ref, self.discount = ref, discount
+        self.chain = chain if discount == 1.0 else chain * discount
+        first, last = chain.indptr[ref], chain.indptr[ref + 1]
+        self._row = np.zeros(n)  # of ref, without ref itself
+        np.add.at(self._row, chain.indices[first:last], self.chain.data[first:last])
+        self._row[ref] = 0.0
+        self.elimination = elimination or Elimination.of(chain.indptr, chain.indices)
+        self._lu: _CompiledLU | _SuperLU
+        if self.elimination.fits:
+            self._lu = _CompiledLU(self.elimination, self.chain.data, ref, 1.0 - discount)
+        else:
+            self._lu = _SuperLU(self.chain, ref, 1.0 - discount, self._row)
         ones = np.ones(n)
         ones[ref] = 0.0
-        self.hitting_time = self._lu.solve(ones)  # expected (discounted) steps to ref
+        with np.errstate(over="ignore", invalid="ignore"):
+            self.hitting_time = self._lu.solve(ones)  # expected (discounted) steps to ref
         if not (np.isfinite(self.hitting_time).all() and self.hitting_time.min() >= 0):
             raise SingularChainError(f"state {ref} is not reached from every state")
 
     @classmethod
-    def adapted(cls, chain: sp.csr_array, ref: int) -> RegenerativeLU:
+    def adapted(cls, chain: sp.csr_array, ref: int, elimination: Elimination | None = None) -> RegenerativeLU:
         """Cut at ``ref``, or at the likeliest state where ``ref`` is so rare that digits would be lost."""
         try:
-            lu = cls(chain, ref)
+            lu = cls(chain, ref, elimination=elimination)
+            elimination = lu.elimination
             share = lu.stationary()
             likely = int(np.argmax(share))
             if share[likely] < 100 * share[ref] or lu.hitting_time.max() < 1e5:
@@ -95,7 +210,7 @@ class RegenerativeLU:
             likely = likely_state(chain)
             if likely == ref:
                 raise
-        return cls(chain, likely)
+        return cls(chain, likely, elimination=elimination)
 
     def poisson(self, c: np.ndarray, refine: bool = True) -> tuple[float, np.ndarray]:
         """(gain, w) with w + gain = c + discount K w and w[ref] = 0.
@@ -118,6 +233,101 @@ class RegenerativeLU:
 
     def stationary(self) -> np.ndarray:
         """Share of time in each state [S] from ``ref`` on, with discount 1 for ever: the stationary distribution."""
-        d = np.maximum(self._lu.solve(self._row, "T"), 0.0)
-        d[self.ref] = 1.0
+        d = self._lu.visits()
         return np.asarray(d / d.sum())
+
+
+class Share(NamedTuple):
+    """Long-run shares of time."""
+
+    of_state: np.ndarray  # [S], sums to 1
+    relative_error: float  # of each share, at most, had the chain's entries no error; infinite: not known
+
+
+def policy_chain(transition: sp.csr_array, policy: np.ndarray) -> sp.csr_array:
+    """The chain [S, S] that ``policy`` [S, A] makes of a transition matrix [S*A, S]."""
+    n_states, n_actions = policy.shape
+    n = n_states * n_actions
+    choose = sp.csr_array((policy.ravel(), np.arange(n), np.arange(0, n + 1, n_actions)), shape=(n_states, n))
+    chain = sp.csr_array(choose @ transition)
+    chain.eliminate_zeros()
+    return chain
+
+
+def long_run(chain: sp.csr_array, start: np.ndarray, dense: bool = False) -> Share:
+    """Long-run share of time in each state, from ``start`` [S]; chain CSR [S, S], its diagonal is not read.
+
+    Periodic chains and chains with several closed classes are fine: each class counts by the probability of ending in
+    it. ``dense``: eliminate densely, for the sake of a known error, also where there are many states.
+
+    Raises SingularChainError for a class of more than DENSE_STATES states that falls apart in double precision.
+    """
+    chain = sp.csr_array(chain)
+    if not (chain.data > 0).all():
+        chain = chain.copy()
+        chain.eliminate_zeros()
+    reached = reachable_from(chain, start)
+    label, closed = classes(chain)
+    ends = np.unique(label[reached & closed[label]])
+    weight, ending_error = _ending(chain, start, reached, label, ends, dense)
+    share, error = np.zeros(len(start)), 0.0
+    for c, mass in zip(ends, weight, strict=True):
+        inside = np.flatnonzero(label == c)
+        part = stationary(chain if len(inside) == len(start) else sp.csr_array(chain[inside][:, inside]), dense)
+        share[inside] = mass * part.of_state
+        error = max(error, part.relative_error)
+    return Share(share, error + ending_error)
+
+
+def stationary(chain: sp.csr_array, dense: bool = False) -> Share:
+    """Of one closed class [S, S], entries > 0. Parts of it may be all but closed. Raises as ``long_run``."""
+    n = chain.shape[0]
+    found = _dense_stationary(chain) if n <= (DENSE_STATES if dense else GTH_STATES) else None
+    if found is None or not np.isfinite(found.relative_error):
+        try:
+            return Share(RegenerativeLU.adapted(chain, 0).stationary(), np.inf)
+        except SingularChainError:
+            if found is None and n <= DENSE_STATES and not dense:
+                found = _dense_stationary(chain)
+            if found is None:
+                raise
+    return found
+
+
+def _dense_stationary(chain: sp.csr_array) -> Share | None:
+    """By dense elimination, S^3/3 steps, with the error that rounding can have made (docs/theory.md, 5); None where
+    products of probabilities leave double precision."""
+    n = chain.shape[0]
+    if n == 1:
+        return Share(np.ones(1), 0.0)
+    share, sound = kernels.gth(chain.toarray())
+    if not np.isfinite(share).all():
+        return None
+    return Share(np.asarray(share), 8.0 * n * (n + 2) * EPSILON if sound else np.inf)
+
+
+def _ending(
+    chain: sp.csr_array, start: np.ndarray, reached: np.ndarray, label: np.ndarray, ends: np.ndarray, dense: bool
+) -> tuple[np.ndarray, float]:
+    """(probability [n_ends] of ending in each of the classes ``ends``, its relative error): shares of time in a chain
+    that begins anew once it is in one of them."""
+    if len(ends) == 1:
+        return np.ones(1), 0.0
+    passing = np.flatnonzero(reached & ~np.isin(label, ends))
+    n, n_ends = len(passing), len(ends)
+    place = np.full(len(start), -1)
+    place[passing] = np.arange(n)
+    for i, c in enumerate(ends):
+        place[label == c] = n + i
+    origin = np.repeat(np.arange(len(start)), np.diff(chain.indptr))
+    used = (place[origin] >= 0) & (place[origin] < n)
+    first = np.flatnonzero(start > 0)
+    again = n + n_ends
+    rows = np.concatenate([place[origin[used]], n + np.arange(n_ends), np.full(len(first), again)])
+    columns = np.concatenate([place[chain.indices[used]], np.full(n_ends, again), place[first]])
+    data = np.concatenate([chain.data[used], np.ones(n_ends), start[first]])
+    anew = sp.csr_array((data, (rows, columns)), shape=(again + 1, again + 1))
+    anew.sum_duplicates()
+    share = stationary(anew, dense)
+    ended = share.of_state[n:again]
+    return np.asarray(ended / ended.sum()), 2 * share.relative_error

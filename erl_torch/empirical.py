@@ -24,7 +24,7 @@ import scipy.sparse as sp
 from erl_torch import checks, kernels
 from erl_torch.chains import classes
 from erl_torch.checks import InputError
-from erl_torch.mdp import check_policy
+from erl_torch.mdp import check_prior, normalise_rows
 from erl_torch.solvers.problem import Problem
 from erl_torch.transitions import Recording
 
@@ -56,10 +56,7 @@ class EmpiricalMDP:
             InputError: beta or prior out of range, or no state that is ever returned to.
         """
         checks.temperature("beta", beta)
-        prior = check_policy("prior_policy", prior_policy, self.n_states, self.n_actions)
-        if not (prior > 0).all():
-            s, a = np.argwhere(prior <= 0)[0]
-            raise InputError(f"prior_policy[{s}, {a}]", prior[s, a], "> 0 (leave the action out instead)")
+        prior = check_prior("prior_policy", prior_policy, self.n_states, self.n_actions)
         used, entries, message, reducible = self._part()
         inside = used.any(1)
         states = np.flatnonzero(inside)
@@ -70,8 +67,8 @@ class EmpiricalMDP:
         p.data = p.data * entries
         p = sp.csr_array(p[rows][:, states])
         p.eliminate_zeros()
-        p = sp.csr_array(sp.diags_array(1 / p.sum(axis=1)) @ p)
         p.sort_indices()
+        normalise_rows(str, p.indptr, p.data, np.inf)
         weight = (prior * used)[states]
         mass = weight.sum(1, keepdims=True)
         reward = np.take_along_axis(self.reward[states], action, axis=1) + np.log(np.minimum(mass, 1.0)) / beta

@@ -12,18 +12,15 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 import scipy.sparse as sp
-import scipy.sparse.linalg as spla
 
-from erl_torch import kernels
-from erl_torch.chains import RegenerativeLU, SingularChainError, classes
+from erl_torch import certificates, chains, kernels
+from erl_torch.certificates import one_step_worth, policy_gains
+from erl_torch.chains import GTH_STATES, classes, long_run
 from erl_torch.experience import batched, reset
 from erl_torch.mdp import TabularMDP, check_policy
 from erl_torch.models import known_mdp, sizes
 from erl_torch.rng import Streams
 from erl_torch.sampling import policy_cdf, sampling_tables
-
-GTH_STATES = 100  # up to here eliminating states is faster than a sparse LU
-DENSE_STATES = 2000  # up to here a nearly reducible chain is solved densely: seconds, 32 MB
 
 
 class Evaluation(NamedTuple):
@@ -43,10 +40,7 @@ class PolicyChain(NamedTuple):
 
 def policy_chain(mdp: TabularMDP, policy: np.ndarray) -> PolicyChain:
     """The chain of ``policy`` [S, A]."""
-    n_states, n_actions = policy.shape
-    n = n_states * n_actions
-    choose = sp.csr_array((policy.ravel(), np.arange(n), np.arange(0, n + 1, n_actions)), shape=(n_states, n))
-    return PolicyChain(sp.csr_array(choose @ mdp.transition), (policy * mdp.reward).sum(1))
+    return PolicyChain(chains.policy_chain(mdp.transition, policy), (policy * mdp.reward).sum(1))
 
 
 def kl_per_state(policy: np.ndarray, prior: np.ndarray) -> np.ndarray:
@@ -68,38 +62,9 @@ def stationary_distribution(transition: sp.csr_array, start: np.ndarray) -> np.n
     """Long-run share of time in each state, from ``start`` [S]; chain as CSR [S, S].
 
     Periodic chains and chains with several closed classes are fine: each class counts by the probability
-    of ending in it.
+    of ending in it. No digit is lost where the chain rarely moves between its parts (``erl_torch.chains``).
     """
-    chain = sp.csr_array(transition)
-    chain.eliminate_zeros()
-    label, closed = classes(chain)
-    transient = ~closed[label]
-    # Expected visits to transient states, hence the flow into each closed class.
-    inflow = start.copy()
-    if transient.any():
-        among = chain[transient][:, transient]
-        visits = spla.spsolve(sp.csc_array(sp.eye_array(int(transient.sum())) - among.T), start[transient])
-        inflow = inflow + chain[transient].T @ np.atleast_1d(visits)
-    share = np.zeros(len(start))
-    for c in np.flatnonzero(closed):
-        inside = label == c
-        mass = inflow[inside].sum()
-        if mass > 0:
-            share[inside] = mass * _stationary(sp.csr_array(chain[inside][:, inside]))
-    return share
-
-
-def _stationary(chain: sp.csr_array) -> np.ndarray:
-    """Of one closed class. Parts of it may be all but closed: more than differences in double precision can tell."""
-    try:
-        return RegenerativeLU.adapted(chain, 0).stationary()
-    except SingularChainError:
-        if chain.shape[0] > DENSE_STATES:
-            raise
-        share = np.asarray(kernels.gth(chain.toarray()))
-        if not np.isfinite(share).all():  # products of probabilities underflow
-            raise
-        return share
+    return long_run(transition, start).of_state
 
 
 def induced_distribution(mdp: TabularMDP, policy: np.ndarray, horizon: int | None = None) -> np.ndarray:
@@ -114,11 +79,11 @@ def induced_distribution(mdp: TabularMDP, policy: np.ndarray, horizon: int | Non
 
 
 def objective(mdp: TabularMDP, policy: np.ndarray, prior: np.ndarray, beta: float) -> float:
-    """J(pi): stationary reward rate minus KL/beta, from the start distribution; reward a step."""
-    chain = policy_chain(mdp, policy)
-    d = stationary_distribution(chain.transition, mdp.start)
-    used = d > 0
-    return float(d[used] @ (chain.reward - kl_per_state(policy, prior) / beta)[used])
+    """J(pi): stationary reward rate minus KL/beta, from the start distribution; reward a step.
+
+    ``certificates.objective`` has the same figure with bounds.
+    """
+    return certificates.objective(mdp.transition, mdp.reward, prior, beta, policy, mdp.start).value
 
 
 def evaluate(
@@ -203,9 +168,10 @@ class Judge:
         """As the function of that name."""
         if self._small and (policy > 0).all():
             chain = sp.csr_array((self._chain(policy), self._columns, self._rows))
-            share = np.asarray(kernels.gth(chain[self._inside][:, self._inside].toarray()))
-            if np.isfinite(share).all():
-                worth = (policy * self.mdp.reward).sum(1) - kl_per_state(policy, self.prior) / beta
+            share, sound = kernels.gth(chain[self._inside][:, self._inside].toarray())
+            if sound:
+                parts = (self.mdp.transition, self.mdp.reward, self.prior, beta, policy)
+                worth = one_step_worth(*policy_gains(*parts, np.zeros(len(policy))))
                 return float(share @ worth[self._inside])
         return objective(self.mdp, policy, self.prior, beta)
 

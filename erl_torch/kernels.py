@@ -752,30 +752,259 @@ def chain_of(data, place, policy, indptr, chain):
 
 
 @numba.njit(cache=True, error_model="numpy", nogil=True)
-def gth(p):
-    """Stationary distribution [S] of one closed class, dense p [S, S] (destroyed), without a subtraction.
+def _compensated(x, n):
+    """Sum of the first n of x >= 0, within 2 units of the last place (Neumaier)."""
+    total, lost = 0.0, 0.0
+    for i in range(n):
+        new = total + x[i]
+        lost += (total - new) + x[i] if total >= x[i] else (x[i] - new) + total
+        total = new
+    return total + lost
 
-    Grassmann, Taksar, Heyman (1985): every component to nearly full relative accuracy, however rarely the
-    chain moves between its parts.
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def row_sums(indptr, data, sums):
+    """Sums of CSR rows with entries >= 0, each within 2 units of the last place."""
+    for row in range(indptr.size - 1):
+        sums[row] = _compensated(data[indptr[row] :], indptr[row + 1] - indptr[row])
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def gth(p):
+    """(stationary distribution [S], whether its digits can be trusted) of one closed class, dense p [S, S] (destroyed).
+
+    Grassmann, Taksar, Heyman (1985): no subtraction, the diagonal is not read, and every component comes out to nearly
+    full relative accuracy, however rarely the chain moves between its parts (docs/theory.md, 5). Not to be trusted:
+    a product has left the range of normal numbers.
     """
     n = p.shape[0]
+    tiny = 1e-307
+    sound = True
+    # In units of each state's own largest rate: slow states cost no range.
+    rate = np.ones(n)
+    for i in range(n):
+        top = 0.0
+        for j in range(n):
+            if j != i:
+                top = max(top, p[i, j])
+        if n > 1 and not top >= tiny:
+            return np.full(n, np.nan), False
+        rate[i] = top
+        for j in range(n):
+            if 0.0 < p[i, j] < tiny:
+                sound = False
+            p[i, j] /= top
     for k in range(n - 1, 0, -1):
-        out = 0.0
-        for j in range(k):
-            out += p[k, j]
+        out = _compensated(p[k], k)
+        if not out >= tiny:
+            return np.full(n, np.nan), False
         for i in range(k):
-            p[i, k] /= out
-            weight = p[i, k]
-            if weight > 0.0:
+            if p[i, k] > 0.0:
+                weight = p[i, k] / out
+                p[i, k] = weight
+                sound = sound and weight >= tiny
                 for j in range(k):
-                    p[i, j] += weight * p[k, j]
+                    if p[k, j] > 0.0:
+                        p[i, j] += weight * p[k, j]
+                        sound = sound and (p[i, j] >= tiny or i == j)
     x = np.zeros(n)
     x[0] = 1.0
     for k in range(1, n):
         for i in range(k):
             x[k] += x[i] * p[i, k]
         x[: k + 1] /= np.max(x[: k + 1])
-    return x / np.sum(x)
+    least = np.min(rate)
+    top = 0.0
+    for k in range(n):
+        top = max(top, x[k] * (least / rate[k]))
+    for k in range(n):
+        # A component out of range is nothing beside the others, unless its state is slow.
+        sound = sound and (x[k] >= tiny or tiny * (least / rate[k]) < 1e-30 * top)
+        x[k] *= least / rate[k]
+    return x / np.sum(x), sound and np.isfinite(np.sum(x))
+
+
+# ---------------------------------------------------------------------------------------------------
+# Certificates: one-step gains with what rounding can have done to them (docs/theory.md, 5)
+# ---------------------------------------------------------------------------------------------------
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def _drift(indices, data, first, last, value, s):
+    """(sum_s' p (V(s') - V(s)), sum_s' p |V(s') - V(s)|) over one CSR row: s itself plays no part."""
+    total, lost, size = 0.0, 0.0, 0.0
+    for m in range(first, last):
+        if indices[m] != s:
+            x = data[m] * (value[indices[m]] - value[s])
+            size += abs(x)
+            new = total + x
+            lost += (total - new) + x if abs(total) >= abs(x) else (x - new) + total
+            total = new
+    return total + lost, size
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def _soft_maximum(q, weight, beta, choice):
+    """((1/beta) log sum_a weight exp(beta q) / sum_a weight, bound on its rounding); fills choice, the weights there.
+
+    weight [A] >= 0, not all 0. Around the largest q where that keeps half of the weight, a sum of terms of one sign;
+    around the largest weighted term otherwise: no digit cancels in either.
+    """
+    n = q.size
+    epsilon = 2.0**-52
+    top = -np.inf
+    total = 0.0
+    for a in range(n):
+        total += weight[a]
+        if weight[a] > 0.0:
+            top = max(top, q[a])
+    below = 0.0
+    for a in range(n):
+        choice[a] = 0.0
+        if weight[a] > 0.0:
+            below += weight[a] * math.expm1(beta * (q[a] - top))
+    below /= total
+    summed = 0.0
+    if below >= -0.5:
+        logarithm = math.log1p(below)
+        for a in range(n):
+            if weight[a] > 0.0:
+                choice[a] = weight[a] * math.exp(beta * (q[a] - top))
+                summed += choice[a]
+    else:
+        largest = -np.inf
+        for a in range(n):
+            if weight[a] > 0.0:
+                choice[a] = beta * (q[a] - top) + math.log(weight[a])
+                largest = max(largest, choice[a])
+        for a in range(n):
+            if weight[a] > 0.0:
+                choice[a] = math.exp(choice[a] - largest)
+                summed += choice[a]
+        logarithm = largest + math.log(summed) - math.log(total)
+    for a in range(n):
+        choice[a] /= summed
+    found = top + logarithm / beta
+    size = -logarithm if below >= -0.5 else abs(logarithm) + math.log(n)
+    return found, (n + 20) * epsilon * abs(size) / beta + 2.0 * epsilon * abs(found)
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def soft_rows(q, prior, beta, backed_up, policy):
+    """backed_up(s) = (1/beta) log sum_a prior exp(beta q) and the policy that attains it; q, prior, policy [S, A]."""
+    for s in range(q.shape[0]):
+        backed_up[s], _ = _soft_maximum(q[s], prior[s], beta, policy[s])
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def gain_rows(indptr, indices, data, reward, prior, beta, value, gain, low, high, policy):
+    """gain = TV - V [S] with low <= gain <= high in exact arithmetic, and pi_V [S, A].
+
+    The rows of the transition matrix (CSR) and of the prior count as divided by their sums, which are 1 within 1e-15.
+    A gain that is no finite number has infinite bounds.
+    """
+    n_states, n_actions = reward.shape
+    epsilon = 2.0**-52
+    q, error, scratch = np.empty(n_actions), np.empty(n_actions), np.empty(n_actions)
+    for s in range(n_states):
+        top = -np.inf
+        for a in range(n_actions):
+            k = s * n_actions + a
+            drift, size = _drift(indices, data, indptr[k], indptr[k + 1], value, s)
+            q[a] = reward[s, a] + drift
+            error[a] = 10.0 * epsilon * size + epsilon * abs(q[a]) + 1e-320 * (1 + indptr[k + 1] - indptr[k])
+            if prior[s, a] > 0.0:
+                top = max(top, q[a])
+        for a in range(n_actions):
+            error[a] += 2.0 * epsilon * abs(q[a] - top)
+        gain[s], _ = _soft_maximum(q, prior[s], beta, policy[s])
+        below, rounding = _soft_maximum(q - error, prior[s], beta, scratch)
+        low[s] = below - rounding
+        above, rounding = _soft_maximum(q + error, prior[s], beta, scratch)
+        high[s] = above + rounding
+        if not (np.isfinite(low[s]) and np.isfinite(high[s])):
+            low[s], high[s] = -np.inf, np.inf
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def _relative_entropy(policy, prior):
+    """(low, high) of sum_a pi log(pi / pi0) in nats, both rows divided by their sums; infinite off the support.
+
+    A sum of terms pi0 h(pi/pi0 - 1) >= 0, h(x) = (1 + x) log(1 + x) - x: nothing cancels where pi is close to pi0.
+    """
+    epsilon = 2.0**-52
+    n = policy.size
+    total, of_prior, found, size = 0.0, 0.0, 0.0, 0.0
+    same = True
+    for a in range(n):
+        total += policy[a]
+        of_prior += prior[a]
+        if policy[a] > 0.0 and not prior[a] > 0.0:
+            return np.inf, np.inf
+        if policy[a] == prior[a]:
+            continue
+        same = False
+        x = (policy[a] - prior[a]) / prior[a]
+        if abs(x) < 0.1:
+            h, power = 0.0, x
+            for j in range(2, 20):
+                power *= -x
+                h -= power / (j * (j - 1))
+            found += prior[a] * h
+            size += policy[a] * abs(x)
+        elif policy[a] > 0.0:
+            ratio = policy[a] / prior[a]
+            logarithm = math.log(policy[a]) - math.log(prior[a])
+            spoilt = abs(math.log(policy[a])) + abs(math.log(prior[a]))
+            if 1e-300 < ratio < 1e300:
+                logarithm = math.log(ratio)
+                spoilt = abs(logarithm) + 1.0
+            found += policy[a] * logarithm - (policy[a] - prior[a])
+            size += policy[a] * spoilt + abs(policy[a] - prior[a])
+        else:
+            found += prior[a]
+    if same:
+        return 0.0, 0.0
+    apart = (abs(total - of_prior) + (n + 2) * epsilon) / total
+    found = max(found / total, 0.0)
+    rounding = (n + 40) * epsilon * found + 8.0 * epsilon * size
+    return max(found - rounding - apart * apart, 0.0), found + rounding
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def policy_gain_rows(indptr, indices, data, reward, prior, beta, policy, value, low, high):
+    """low <= T_pi V - V <= high [S] in exact arithmetic, T_pi V = sum_a pi (r + E V - log(pi/pi0)/beta).
+
+    Rows count as divided by their sums, as in ``gain_rows``.
+    """
+    n_states, n_actions = reward.shape
+    epsilon = 2.0**-52
+    for s in range(n_states):
+        total, mean, lost, error, size = 0.0, 0.0, 0.0, 0.0, 0.0
+        for a in range(n_actions):
+            if policy[s, a] > 0.0:
+                k = s * n_actions + a
+                drift, moved = _drift(indices, data, indptr[k], indptr[k + 1], value, s)
+                q = reward[s, a] + drift
+                total += policy[s, a]
+                x = policy[s, a] * q
+                size += abs(x)
+                new = mean + x
+                lost += (mean - new) + x if abs(mean) >= abs(x) else (x - new) + mean
+                mean = new
+                error += policy[s, a] * (10.0 * epsilon * moved + 1e-320 * (1 + indptr[k + 1] - indptr[k])) + 1e-320
+        least, most = _relative_entropy(policy[s], prior[s])
+        mean = (mean + lost) / total
+        error = 2.0 * error + (n_actions + 12) * epsilon * size
+        low[s] = mean - most / beta
+        high[s] = mean - least / beta
+        if least == np.inf:
+            low[s], high[s] = -np.inf, -np.inf
+            continue
+        low[s] -= error + 2.0 * epsilon * (abs(mean) + most / beta)
+        high[s] += error + 2.0 * epsilon * (abs(mean) + least / beta)
+        if not (np.isfinite(low[s]) and np.isfinite(high[s])):
+            low[s], high[s] = -np.inf, np.inf
 
 
 # ---------------------------------------------------------------------------------------------------
@@ -932,11 +1161,12 @@ def lu_pattern(ptr, ind, rank):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _cut_lu(ptr, column, chain, order, ref, lptr, lind, uptr, uind, low, up, diagonal, to_ref, row):
+def cut_lu(ptr, column, chain, order, ref, leak, lptr, lind, uptr, uind, low, up, diagonal, to_ref, row):
     """LU of I - K without the row and column of ``ref`` (a rank); fills low, up, diagonal. ``row`` [n] is zero.
 
-    K is row-stochastic: a pivot is the sum of the rest of its row, nothing is subtracted, and every entry of the
-    factors is accurate however rarely ``ref`` is met (Grassmann, Taksar, Heyman). Stored with the sign of K.
+    The rows of K sum to 1 - ``leak``: a pivot is the sum of the rest of its row and of what leaks, nothing is
+    subtracted, and every entry of the factors is accurate however rarely ``ref`` is met (Grassmann, Taksar, Heyman).
+    Stored with the sign of K.
     """
     for k in range(order.size):
         if k == ref:
@@ -948,7 +1178,7 @@ def _cut_lu(ptr, column, chain, order, ref, lptr, lind, uptr, uind, low, up, dia
         s = order[k]
         for m in range(ptr[s], ptr[s + 1]):
             row[column[m]] = chain[m]
-        absorbed = row[ref]
+        absorbed = row[ref] + leak
         row[ref] = 0.0
         for e in range(lptr[k], lptr[k + 1]):
             i = lind[e]
@@ -970,7 +1200,7 @@ def _cut_lu(ptr, column, chain, order, ref, lptr, lind, uptr, uind, low, up, dia
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _cut_solve(lptr, lind, uptr, uind, low, up, diagonal, x):
+def cut_solve(lptr, lind, uptr, uind, low, up, diagonal, x):
     """x [n] becomes the solution of (I - K) x = x, in ranks."""
     for k in range(x.size):
         total = x[k]
@@ -985,7 +1215,7 @@ def _cut_solve(lptr, lind, uptr, uind, low, up, diagonal, x):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _cut_share(ptr, column, chain, order, ref, lptr, lind, uptr, uind, low, up, diagonal, x):
+def cut_share(ptr, column, chain, order, ref, lptr, lind, uptr, uind, low, up, diagonal, x):
     """Fills x [n], in ranks: visits to each state between two to ``ref``, from the factors cut there."""
     x[:] = 0.0
     for m in range(ptr[order[ref]], ptr[order[ref] + 1]):
@@ -1110,9 +1340,11 @@ def newton_perron(
     for step in range(max_steps + 1):
         spread = b - a
         rounding = 64 * epsilon * (1.0 + np.max(np.abs(h)) + max(abs(a), abs(b)))
+        if not (np.isfinite(spread) and np.isfinite(rounding)):
+            break
         if spread <= rtol or (spread <= rounding and spread > 0.25 * before):
             return True, a, b, step
-        if not np.isfinite(spread) or step == max_steps:
+        if step == max_steps:
             break
         before = spread
         for _ in range(2):
@@ -1121,14 +1353,14 @@ def newton_perron(
                 cut[:] = chain
                 for choice in range(2):
                     at = rank[ref]
-                    _cut_lu(ptr, column, cut, order, at, lptr, lind, uptr, uind, low, up, diagonal, to_ref, row)
+                    cut_lu(ptr, column, cut, order, at, 0.0, lptr, lind, uptr, uind, low, up, diagonal, to_ref, row)
                     hitting[:] = 1.0
                     hitting[at] = 0.0
-                    _cut_solve(lptr, lind, uptr, uind, low, up, diagonal, hitting)
+                    cut_solve(lptr, lind, uptr, uind, low, up, diagonal, hitting)
                     if choice == 1 or np.max(hitting) < 1e5:
                         break
                     # A state that is met so rarely costs digits.
-                    _cut_share(ptr, column, cut, order, at, lptr, lind, uptr, uind, low, up, diagonal, x)
+                    cut_share(ptr, column, cut, order, at, lptr, lind, uptr, uind, low, up, diagonal, x)
                     if not np.max(x) > 100.0:
                         break
                     ref = order[np.argmax(x)]
@@ -1139,7 +1371,7 @@ def newton_perron(
                 x[k] = gain[order[k]] - middle
             common = x[rank[ref]]
             x[rank[ref]] = 0.0
-            _cut_solve(lptr, lind, uptr, uind, low, up, diagonal, x)
+            cut_solve(lptr, lind, uptr, uind, low, up, diagonal, x)
             length = 1.0
             for m in range(ptr[ref], ptr[ref + 1]):
                 if ind[m] != ref:

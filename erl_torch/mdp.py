@@ -7,18 +7,23 @@ Row ``s * n_actions + a`` of ``transition`` is p(.|s, a). ``reward`` is the expe
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import InitVar, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 
+from erl_torch import kernels
 from erl_torch.checks import InputError
 from erl_torch.files import read_npz, write_npz
+from erl_torch.notes import note
 
-ROW_SUM_TOLERANCE = 1e-9
+ROW_SUM_TOLERANCE = 1e-5  # single precision is welcome
+AS_GIVEN = 1e-15  # rows whose sums are this close to 1 keep their bits
+WORTH_A_NOTE = 1e-9
+SMALLEST_PRIOR = 1e-307
 LARGEST_REWARD = 1e100  # products of such numbers stay in range
 CSR_PARTS = ("indptr", "indices", "data")
 
@@ -32,17 +37,22 @@ class TabularMDP:
             repeated entries are summed.
         reward: [S, A], reward a step.
         start: [S], distribution of the first state; None is uniform.
+        normalise: divide every row, and start, by its sum, whatever that is.
+
+    Rows and start that sum to 1 within 1e-5 are divided by their sums in any case: what is kept, solved and certified
+    are the rows as they stand in ``transition``. A ``Note`` names the largest correction above 1e-9.
 
     Raises:
-        InputError: wrong shape, a value that is not finite or negative, a row that does not sum to 1
-            within 1e-9 (the row is named).
+        InputError: wrong shape, an index out of range, a value that is not finite or negative, a row that does not
+            sum to 1 within 1e-5, or to 0 with ``normalise`` (the row is named).
     """
 
     transition: sp.csr_array  # [S*A, S], float64, sorted, no repeated or zero entries
     reward: np.ndarray  # [S, A], float64
     start: np.ndarray = None  # type: ignore[assignment]  # [S], float64
+    normalise: InitVar[bool] = False
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, normalise: bool) -> None:
         reward = _dense("reward", self.reward)
         if reward.ndim != 2 or 0 in reward.shape:
             raise InputError("reward", f"array of shape {reward.shape}", "of shape [n_states, n_actions]")
@@ -52,14 +62,18 @@ class TabularMDP:
             s, a = np.argwhere(~usable)[0]
             raise InputError(f"reward[{s}, {a}]", reward[s, a], f"finite, and at most {LARGEST_REWARD:g} in size")
         transition = _csr(self.transition, n_states, n_actions)
-        _check_rows(transition, n_actions)
-        start = np.full(n_states, 1.0 / n_states) if self.start is None else _dense("start", self.start)
+        _check_entries(transition, n_actions)
+        start = np.full(n_states, 1.0 / n_states) if self.start is None else _dense("start", self.start).copy()
         if start.shape != (n_states,):
             raise InputError("start", f"array of shape {start.shape}", f"of shape [{n_states}]")
         if not (np.isfinite(start).all() and (start >= 0).all()):
             raise InputError("start", "array", "finite and >= 0 everywhere")
-        if abs(start.sum() - 1) > ROW_SUM_TOLERANCE:
-            raise InputError("start", f"array with sum {start.sum():.12g}", "a distribution (sum 1)")
+        tolerance = np.inf if normalise else ROW_SUM_TOLERANCE
+        largest = max(
+            normalise_rows(lambda row: _row_name(row, n_actions), transition.indptr, transition.data, tolerance),
+            normalise_rows(lambda row: "start", np.array([0, n_states]), start, tolerance),
+        )
+        _say_corrected("rows of transition and start", largest)
         object.__setattr__(self, "transition", transition)
         object.__setattr__(self, "reward", reward)
         object.__setattr__(self, "start", start)
@@ -106,10 +120,51 @@ def check_policy(key: str, policy: Any, n_states: int, n_actions: int) -> np.nda
         raise InputError(key, f"array of shape {table.shape}", f"of shape [{n_states}, {n_actions}]")
     if not (np.isfinite(table).all() and (table >= 0).all()):
         raise InputError(key, "array", "finite and >= 0 everywhere")
-    bad = np.flatnonzero(np.abs(table.sum(1) - 1) > ROW_SUM_TOLERANCE)
-    if bad.size:
-        raise InputError(f"{key}[{bad[0]}]", f"row with sum {table[bad[0]].sum():.12g}", "a distribution")
+    table = table.copy()
+    rows = np.arange(n_states + 1) * n_actions
+    _say_corrected(f"rows of {key}", normalise_rows(lambda row: f"{key}[{row}]", rows, table.reshape(-1)))
     return table
+
+
+def check_prior(key: str, prior: Any, n_states: int, n_actions: int) -> np.ndarray:
+    """As ``check_policy``, for a prior, which is nowhere 0 (nor below 1e-307, where digits are lost)."""
+    table = check_policy(key, prior, n_states, n_actions)
+    if not (table >= SMALLEST_PRIOR).all():
+        s, a = np.argwhere(table < SMALLEST_PRIOR)[0]
+        allowed = "> 0 (leave the action out instead)" if table[s, a] == 0 else f">= {SMALLEST_PRIOR:g}"
+        raise InputError(f"{key}[{s}, {a}]", table[s, a], allowed)
+    return table
+
+
+def normalise_rows(
+    name: Callable[[int], str], indptr: np.ndarray, data: np.ndarray, tolerance: float = ROW_SUM_TOLERANCE
+) -> float:
+    """Divide rows of ``data`` (CSR; finite, >= 0), in place, by their sums; those within 1e-15 of 1 stay as they are.
+
+    Returns the largest distance of a sum from 1. Raises InputError for a row, by its ``name``, whose sum is further
+    than ``tolerance`` from 1, 0 or infinite.
+    """
+    sums = np.empty(len(indptr) - 1)
+    kernels.row_sums(indptr, data, sums)
+    off = np.abs(sums - 1)
+    if not off.max(initial=0.0) > AS_GIVEN:
+        return 0.0
+    bad = np.flatnonzero((off > tolerance) | ~((sums > 0) & np.isfinite(sums)))
+    if bad.size:
+        allowed = "of a finite sum > 0" if np.isinf(tolerance) else f"1 in sum, within {tolerance:g}"
+        raise InputError(name(int(bad[0])), f"sum {sums[bad[0]]:.12g}", allowed)
+    for _ in range(2):  # an entry below double precision's normal numbers may need the second
+        factor = np.where(np.abs(sums - 1) > AS_GIVEN, sums, 1.0)
+        data /= np.repeat(factor, np.diff(indptr))
+        kernels.row_sums(indptr, data, sums)
+        if not np.abs(sums - 1).max() > AS_GIVEN:
+            break
+    return float(off.max())
+
+
+def _say_corrected(what: str, largest: float) -> None:
+    if largest > WORTH_A_NOTE:
+        note(f"{what} did not sum to 1, by up to {largest:.1e}: they were divided by their sums")
 
 
 def _dense(key: str, value: Any) -> np.ndarray:
@@ -149,23 +204,23 @@ def _csr(value: Any, n_states: int, n_actions: int) -> sp.csr_array:
             f"array of shape {tuple(value.shape)}",
             f"of shape [{n_states * n_actions}, {n_states}] to go with reward [{n_states}, {n_actions}]",
         )
-    csr = sp.csr_array(value, dtype=np.float64, copy=True)
+    try:
+        csr = sp.csr_array(value, dtype=np.float64, copy=True)
+        csr.check_format(full_check=True)  # compiled loops trust the indices
+    except (ValueError, TypeError, IndexError) as error:
+        raise InputError("transition", "sparse matrix", f"a matrix [S*A, S] with indices in range ({error})") from error
     csr.sum_duplicates()
     csr.eliminate_zeros()
     csr.sort_indices()
     return csr
 
 
-def _check_rows(transition: sp.csr_array, n_actions: int) -> None:
-    def name(row: int) -> str:
-        return f"transition row {row} (state {row // n_actions}, action {row % n_actions})"
+def _row_name(row: int, n_actions: int) -> str:
+    return f"transition row {row} (state {row // n_actions}, action {row % n_actions})"
 
+
+def _check_entries(transition: sp.csr_array, n_actions: int) -> None:
     bad = np.flatnonzero(~(np.isfinite(transition.data) & (transition.data >= 0)))
     if bad.size:
         row = int(np.searchsorted(transition.indptr, bad[0], side="right")) - 1
-        raise InputError(name(row), transition.data[bad[0]], "finite and >= 0 everywhere")
-    sums = transition.sum(axis=1)
-    bad = np.flatnonzero(np.abs(sums - 1) > ROW_SUM_TOLERANCE)
-    if bad.size:
-        row = int(bad[0])
-        raise InputError(name(row), f"sum {sums[row]:.12g}", f"1 in sum, within {ROW_SUM_TOLERANCE:g}")
+        raise InputError(_row_name(row, n_actions), transition.data[bad[0]], "finite and >= 0 everywhere")

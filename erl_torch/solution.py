@@ -41,8 +41,8 @@ class Solution:
     """
 
     policy: torch.Tensor  # [S, A], rows sum to 1
-    u: torch.Tensor  # [S, A] > 0, mean 1
-    psi: torch.Tensor  # [S] > 0, 1 / sum_a prior(a|s) u(s,a)
+    u: torch.Tensor  # [S, A] > 0, mean 1; 0 or infinite beyond double precision, where ``log_u`` is not
+    psi: torch.Tensor  # [S] > 0, 1 / sum_a prior(a|s) u(s,a); likewise, ``log_psi``
     rho: float | None = None
     theta: float | None = None  # reward a step; -theta is the regularised reward rate
     reward_bias: torch.Tensor  # [S, A] >= 0, reward a step
@@ -57,6 +57,20 @@ class Solution:
     theta_bounds: tuple[float, float] | None = None  # two-sided, on theta*; where the model is known
     gap: float | None = None  # at least -theta* - J(policy), reward a step; where the model is known
     k: int | None = None  # biasing iterations as the paper's Table S1 counts them
+
+    @property
+    def log_u(self) -> torch.Tensor:
+        """log u(s,a), [S, A], up to a constant: finite also where u itself leaves double precision."""
+        if self.action_value is not None and self.beta is not None:
+            return self.beta * self.action_value
+        return self.u.log()
+
+    @property
+    def log_psi(self) -> torch.Tensor:
+        """log psi(s), [S], up to a constant: finite also where psi itself leaves double precision."""
+        if self.value is not None and self.beta is not None:
+            return -self.beta * self.value
+        return self.psi.log()
 
     def value_functions(self, n_steps: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
         """(Q [S, A], V [S]) of equations (1) and (2) for trajectories of ``n_steps``; reward, up to a constant.

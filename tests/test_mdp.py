@@ -83,7 +83,7 @@ def changed(array, index, value):
         ((P, R.ravel()), r"reward=array of shape \(6,\): must be of shape \[n_states, n_actions\]"),
         ((P, "reward"), r"reward=str: must be an array of numbers"),
         ((P, R, [0.5, 0.5]), r"start=array of shape \(2,\): must be of shape \[3\]"),
-        ((P, R, [0.5, 0.5, 0.5]), r"start=array with sum 1.5: must be a distribution"),
+        ((P, R, [0.5, 0.5, 0.5]), r"start=sum 1.5: must be 1 in sum, within 1e-05"),
         ((P, R, [1.5, -0.5, 0.0]), r"start=array: must be finite and >= 0"),
     ],
 )
@@ -97,7 +97,7 @@ def test_policies_are_checked():
     assert np.array_equal(check_policy("p", None, 2, 4), np.full((2, 4), 0.25))
     for bad, message in [
         (np.full((2, 3), 1 / 3), "shape"),
-        (np.full((2, 4), 0.3), r"p\[0\]=row with sum 1.2"),
+        (np.full((2, 4), 0.3), r"p\[0\]=sum 1.2: must be 1 in sum"),
         (np.array([[2.0, -1, 0, 0]] * 2), ">= 0"),
     ]:
         with pytest.raises(InputError, match=message):

@@ -28,7 +28,7 @@ from erl_torch.chains import RegenerativeLU, SingularChainError, classes, reacha
 from erl_torch.envs.windy_cliff import WindyCliffEnv
 from erl_torch.evaluation import induced_distribution, kl_per_state, objective, policy_chain, reward_per_step
 from erl_torch.learners import Exact
-from erl_torch.solvers.problem import Problem, soft_backup, theta_bounds
+from erl_torch.solvers.problem import Problem
 
 CLIFF = WindyCliffEnv().mdp
 UNIFORM = np.full((15, 4), 0.25)
@@ -198,9 +198,11 @@ def test_any_value_carries_a_certificate(problem, beta, spread):
     """min(TV - V) <= J(pi_V) <= g* <= max(TV - V), and the gap identity g* - J = E_d KL(pi || pi*)/beta."""
     rng, mdp, prior = problem
     value = spread * rng.standard_normal(mdp.n_states)
+    found = Problem.of(mdp, beta, prior).gains(value)
+    policy, (low, high) = found.policy, found.theta_bounds
     q = mdp.reward + (mdp.transition @ value).reshape(mdp.reward.shape)
-    backed_up, policy = soft_backup(q, prior, beta)
-    low, high = theta_bounds(value, backed_up, mdp.reward)
+    weight = prior * np.exp(beta * (q - q.max(1, keepdims=True)))
+    np.testing.assert_allclose(policy, weight / weight.sum(1, keepdims=True), rtol=1e-9)
     optimum = solve_soft_bellman(mdp, beta, prior, tol=1e-13)
     j = objective(mdp, policy, prior, beta)
     assert -high <= j <= -optimum.theta + 1e-12

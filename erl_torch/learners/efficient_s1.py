@@ -68,6 +68,7 @@ import torch
 from scipy.special import logsumexp
 
 from erl_torch import checks, kernels
+from erl_torch.certificates import soft_backup
 from erl_torch.checks import InputError
 from erl_torch.empirical import EmpiricalMDP, EmpiricalProblem, empirical_mdp, tally
 from erl_torch.evaluation import kl_per_state
@@ -75,7 +76,6 @@ from erl_torch.learners.algorithm_s1 import BLOCK, LOG_PSI_EPSILON
 from erl_torch.learners.fitting import NonFiniteError, columns, epochs, run_to_end
 from erl_torch.mdp import check_policy
 from erl_torch.solution import Solution, Status
-from erl_torch.solvers.problem import soft_backup
 from erl_torch.transitions import Parts, Recording, Selection, Transitions
 
 LAST_STEP = 100_000  # visits of a pair in one biasing iteration after which its step stays

@@ -56,7 +56,7 @@ class Exact:
     Args:
         beta: inverse temperature, 1/reward, > 0.
         method: "biasing" or "soft_bellman".
-        tol: width of the bounds on theta* to stop at, relative to the range of the rewards.
+        tol: width of the bounds on theta* to stop at, as in ``solve_soft_bellman``.
         max_steps: iterations at most.
         prior_policy: [S, A], entries > 0; None is uniform.
 
@@ -92,7 +92,7 @@ class Exact:
         problem = Problem.of(mdp, self.beta, self.prior_policy)
         prior = check_policy("prior_policy", self.prior_policy, mdp.n_states, mdp.n_actions)
         ref = problem.regeneration_state()
-        if ref is None:
+        if ref is None or (self.method == "biasing" and len(problem.classes[1]) > 1):
             return
 
         def full(step: int, state: BiasingState | BellmanState, theta: float, kl_max: float) -> ExactState:
@@ -109,12 +109,12 @@ class Exact:
 
         if self.method == "soft_bellman":
             for newton in iterate_soft_bellman(problem, ref, self.tol, self.max_steps):
-                if newton.step or newton.width <= self.tol * problem.reward_range:
+                if newton.step or problem.is_narrow(newton.theta_bounds, self.tol, newton.policy):
                     yield full(newton.step, newton, 0.5 * sum(newton.theta_bounds), 0.0)
             return
         for state in iterate_biasing(mdp, self.beta, self.prior_policy, max_steps=self.max_steps):
             yield full(state.k + 1, state, state.theta, float(state.kl.max()))
-            if state.theta_bounds[1] - state.theta_bounds[0] <= self.tol * problem.reward_range:
+            if problem.is_narrow(state.theta_bounds, self.tol, state.policy):
                 return
 
     def solution(self, mdp: TabularMDP, state: ExactState, history: list[dict[str, float]], stopped: bool) -> Solution:
@@ -123,7 +123,9 @@ class Exact:
         if not len(state.value):  # no iteration could be made
             return reducible_solution(mdp, problem, self.prior_policy)
         below = [i for i, row in enumerate(history) if row["kl_max"] < KL_TOLERANCE]
-        status, message = how_it_ended(problem, state.theta_bounds, self.tol, state.step, self.max_steps)
+        status, message = how_it_ended(
+            problem, state.theta_bounds, state.policy.numpy()[problem.states], self.tol, state.step, self.max_steps
+        )
         solution = exact_solution(
             mdp,
             problem,

@@ -27,13 +27,14 @@ import numpy as np
 import scipy.sparse as sp
 
 from erl_torch import checks
+from erl_torch.certificates import soft_backup
 from erl_torch.checks import InputError
 from erl_torch.mdp import TabularMDP
 from erl_torch.solution import Solution, Status
 from erl_torch.solvers.compiled import NewtonPattern
 from erl_torch.solvers.eigenpair import solve_log_perron
-from erl_torch.solvers.problem import Problem, soft_backup, theta_bounds
-from erl_torch.solvers.result import bias, exact_solution, how_it_ended, reducible_solution
+from erl_torch.solvers.problem import Problem
+from erl_torch.solvers.result import bias, exact_solution, explain_classes, how_it_ended, reducible_solution
 
 KL_TOLERANCE = 1e-6
 RTOL = 1e-13  # spread of the bounds on an eigenvalue
@@ -47,11 +48,11 @@ class BiasingState:
     k: int  # 0-based
     log_psi: np.ndarray  # [n], behind this iteration's biases; 0 in iteration 0
     reward_bias: np.ndarray  # delta, [n, A], reward
-    theta: float  # -G(V), at most theta*: optimistic
+    theta: float  # -G(V), at most theta*: optimistic; the middle of bounds on it where status is not CONVERGED
     policy: np.ndarray  # [n, A], optimal in the biased problem
     kl: np.ndarray  # KL(optimal dynamics || target dynamics), [n, A], nats
     value: np.ndarray  # [n], after the update: V + log(y)/beta
-    theta_bounds: tuple[float, float]  # on theta*, the best proven so far
+    theta_bounds: tuple[float, float]  # on theta*, the best of all iterations so far
     status: Status  # of the eigenpair
     newton_steps: int
 
@@ -71,13 +72,14 @@ def solve_biasing(
         mdp: the problem; with ``target``, what is known of it before.
         beta, prior_policy: as in ``solve_soft_bellman``.
         target: the MDP to be solved, if it is not ``mdp`` itself: same shapes, its dynamics and rewards count.
-        tol: width of the bounds on theta* to stop at, relative to the range of the rewards.
+        tol: width of the bounds on theta* to stop at, as in ``solve_soft_bellman``.
         max_steps: biasing iterations at most.
         stop: "certificate", or "kl": at iteration k already.
 
     Returns:
-        A Solution with ``k`` (None if the KL test never held) and the certificate; status REDUCIBLE where the states
-        that the start leads to are not one class: the eigenvector needs that (``solve_soft_bellman`` needs less).
+        A Solution with ``k`` (None if the KL test never held) and the certificate. Status REDUCIBLE, and no theta,
+        where the states that the start leads to are not one class: the eigenvector needs that
+        (``solve_soft_bellman`` needs less, and the message says where it will do).
 
     Raises:
         InputError: an argument out of range, or a target of another shape.
@@ -92,13 +94,10 @@ def solve_biasing(
     for state in iterate_biasing(mdp, beta, prior_policy, target, max_steps):
         if k is None and state.kl.max() < KL_TOLERANCE:
             k = state.k
-        width = state.theta_bounds[1] - state.theta_bounds[0]
-        if width <= tol * problem.reward_range or (stop == "kl" and k is not None):
+        if problem.is_narrow(state.theta_bounds, tol, state.policy) or (stop == "kl" and k is not None):
             break
     assert state is not None
-    status, _ = how_it_ended(problem, state.theta_bounds, tol, state.k + 1, max_steps)
-    if stop == "kl" and k is not None:
-        status = Status.CONVERGED
+    status, _ = how_it_ended(problem, state.theta_bounds, state.policy, tol, state.k + 1, max_steps)
     return exact_solution(
         target or mdp, problem, state.value, status, state.k + 1, state.theta_bounds, prior_policy, k=k
     )
@@ -111,32 +110,34 @@ def iterate_biasing(
     target: TabularMDP | None = None,
     max_steps: int = 200,
 ) -> Iterator[BiasingState]:
-    """Yield every biasing iteration; ends after ``max_steps``, or when rounding ends progress.
-
-    Nothing is yielded where the states that the start leads to are not one class.
+    """Every biasing iteration; ends after ``max_steps``, or when rounding ends progress.
 
     Args:
         mdp, beta, prior_policy, target: as in ``solve_biasing``.
         max_steps: biasing iterations at most.
 
     Raises:
-        InputError: an argument out of range, or a target of another shape.
+        InputError: an argument out of range, a target of another shape, or an MDP whose start leads to states that
+            are not one class.
     """
     problem = _problem(mdp, beta, prior_policy, target)
     checks.at_least("max_steps", max_steps, 1)
     ref = problem.regeneration_state()
     if ref is None or len(problem.classes[1]) > 1:
-        return
-    pattern = NewtonPattern.of(problem.transition, problem.n_actions)
-    known, known_pattern = problem, pattern
-    if target is not None:
-        known = Problem.of(mdp, beta, prior_policy)
-        known_pattern = NewtonPattern.of(known.transition, known.n_actions)
+        raise InputError("mdp", explain_classes(problem), "one class of states, for an eigenvector")
+    return _iterate(problem, ref, None if target is None else Problem.of(mdp, beta, prior_policy), max_steps)
+
+
+def _iterate(problem: Problem, ref: int, known: Problem | None, max_steps: int) -> Iterator[BiasingState]:
+    """``known``: solved for in iteration 0, if it is not ``problem``."""
+    beta = problem.beta
+    pattern = NewtonPattern.of(problem)
+    known_pattern = pattern if known is None else NewtonPattern.of(known)
     value = np.zeros(problem.n_states)
     lower, upper = -np.inf, np.inf
     shift_before = np.inf
     for k in range(max_steps):
-        at, its_pattern = (known, known_pattern) if k == 0 else (problem, pattern)
+        at, its_pattern = (known or problem, known_pattern) if k == 0 else (problem, pattern)
         h, bounds, status, newton_steps = _eigenvector(at, value, its_pattern, ref)
         log_psi = -beta * value
         # The policy and the dynamics that are optimal in the biased problem.
@@ -147,11 +148,8 @@ def iterate_biasing(
             kl = _kl_to(problem, at, tilted)
         value = value + h / beta
         value -= value[ref]
-        backed_up, _ = soft_backup(problem.action_value(value), problem.prior, beta)
-        proven = theta_bounds(value, backed_up, problem.reward)
-        lower, upper = max(lower, proven[0]), min(upper, proven[1])
-        if lower > upper:  # by rounding alone
-            lower, upper = proven
+        proven = problem.gains(value)
+        lower, upper = max(lower, proven.theta_bounds[0]), min(upper, proven.theta_bounds[1])
         yield BiasingState(
             k=k,
             log_psi=log_psi,

@@ -10,45 +10,29 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.sparse as sp
-import scipy.sparse.linalg as spla
 
 from erl_torch import kernels
+from erl_torch.chains import EPSILON, Elimination
 from erl_torch.solvers.eigenpair import LOG_POWER_STEPS, POWER_STEPS
-
-MAX_STATES = 4000
-MAX_OPERATIONS = 15_000_000  # multiplications of one LU: some ten milliseconds
+from erl_torch.solvers.problem import Problem
 
 
 @dataclass(frozen=True, eq=False)
 class NewtonPattern:
-    """Which state can follow which, and the fill of the LU factors of such chains."""
+    """A problem's transitions, merged over actions, on the pattern of its chains."""
 
-    transition: sp.csr_array  # [n*A, n]
+    indptr: np.ndarray  # of the transition matrix [n*A, n]
     log_p: np.ndarray  # of its entries
-    slot: np.ndarray  # place of each of its entries in ``ind``
-    ptr: np.ndarray  # [n + 1]
-    ind: np.ndarray  # successors of each state
-    rank: np.ndarray  # [n], place in the elimination
-    lu: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]  # as ``kernels.lu_pattern`` has it
+    slot: np.ndarray  # place of each of its entries in the chain's
+    elimination: Elimination
 
     @classmethod
-    def of(cls, transition: sp.csr_array, n_actions: int) -> NewtonPattern | None:
-        """The pattern of a transition matrix [n*A, n], or None where it is too large or fills too much."""
-        n = transition.shape[1]
-        if n > MAX_STATES:
+    def of(cls, problem: Problem) -> NewtonPattern | None:
+        """None where the problem is too large or its factors fill too much."""
+        if not problem.elimination.fits:
             return None
-        ptr, ind, slot = kernels.state_pattern(transition.indptr, transition.indices, n_actions)
-        # Any values will do: SuperLU is asked for its minimum-degree ordering alone.
-        some = 2 * sp.eye_array(n) - sp.csr_array((np.full(ind.size, 1.0 / n), ind, ptr), shape=(n, n))
-        ordered = spla.splu(
-            some.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-        )
-        rank = ordered.perm_c.astype(np.int32)
-        lu = kernels.lu_pattern(ptr, ind, rank)
-        if (np.diff(lu[2]) ** 2).sum() > MAX_OPERATIONS:
-            return None
-        return cls(transition, np.log(transition.data), slot, ptr, ind, rank, lu)
+        p = problem.transition
+        return cls(p.indptr, np.log(p.data), problem.pattern[2], problem.elimination)
 
     def eigenvector(
         self, log_weight: np.ndarray, ref: int, rtol: float, max_steps: int
@@ -57,14 +41,14 @@ class NewtonPattern:
 
         log_weight [n, A]; ``ref`` is a state to cut chains at. None where the iteration fails.
         """
-        p = self.transition
-        log_m = np.empty(self.ind.size)
-        kernels.merge_log_weights(p.indptr, self.log_p, log_weight, self.slot, self.ptr, log_m)
-        h = np.zeros(p.shape[1])
+        e = self.elimination
+        log_m = np.empty(e.ind.size)
+        kernels.merge_log_weights(self.indptr, self.log_p, log_weight, self.slot, e.ptr, log_m)
+        h = np.zeros(len(e.rank))
         converged, low, high, steps = kernels.newton_perron(
-            self.ptr, self.ind, self.rank, *self.lu, log_m, h, ref, rtol, max_steps, POWER_STEPS, LOG_POWER_STEPS
+            e.ptr, e.ind, e.rank, *e.lu, log_m, h, ref, rtol, max_steps, POWER_STEPS, LOG_POWER_STEPS
         )
         if not converged:
             return None
-        slack = 8 * np.finfo(np.float64).eps * (1 + np.abs(h).max() + max(abs(low), abs(high)))
+        slack = 8 * EPSILON * (1 + np.abs(h).max() + max(abs(low), abs(high)))
         return h, (low - slack, high + slack), steps

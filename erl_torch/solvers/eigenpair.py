@@ -18,7 +18,7 @@ import scipy.sparse as sp
 import torch
 
 from erl_torch import kernels
-from erl_torch.chains import RegenerativeLU, SingularChainError, classes, likely_state
+from erl_torch.chains import Elimination, RegenerativeLU, SingularChainError, classes, likely_state
 from erl_torch.checks import InputError
 from erl_torch.solution import Status
 
@@ -112,6 +112,7 @@ def solve_log_perron(
     best, best_bounds = h, bounds_of(gain)
     refused, before = 0, np.inf
     lu: RegenerativeLU | None = None
+    elimination = Elimination.of(chain.indptr, chain.indices)  # the pattern stays
     for step in range(max_steps + 1):
         spread = np.ptp(gain)
         rounding = 64 * np.finfo(np.float64).eps * (1 + np.abs(h).max() + np.abs(gain).max())
@@ -124,7 +125,7 @@ def solve_log_perron(
             new_gain = new_backed_up - new
             # The factors of an earlier step will do where they still gain two digits.
             if lu is None or not np.ptp(new_gain) < 1e-2 * spread:
-                lu = RegenerativeLU.adapted(chain, ref)
+                lu = RegenerativeLU.adapted(chain, ref, elimination)
                 ref = lu.ref
                 new, (new_backed_up, new_chain) = _step(tilt, h, gain, lu)
                 new_gain = new_backed_up - new

@@ -1,15 +1,13 @@
-"""The soft Bellman backup of a finite MDP, its certificate, and the problem as the solvers hold it.
+"""The problem as the solvers hold it: an MDP on the states that count, with beta and prior.
 
     TV(s) = (1/beta) log sum_a prior(a|s) exp(beta (r(s,a) + E_{s'|s,a} V(s')))
 
-Certificate. For any V, with pi_V ~ prior exp(beta (r + E V)):  min(TV - V) <= J(pi_V) <= -theta* <= max(TV - V).
-Proof: TV - V is the one-step regularised reward of pi_V with the difference V(s') - V(s) added, which averages to
-nothing under a stationary distribution; and of all policies pi_V has the largest such reward in every state. Both
-hold for any chain structure. The bounds returned are wider by what rounding can do.
+is its soft Bellman backup; ``erl_torch.certificates`` has what V and TV prove.
 """
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -18,9 +16,9 @@ import numpy as np
 import scipy.sparse as sp
 
 from erl_torch import checks, kernels
-from erl_torch.chains import classes, reachable_from
-from erl_torch.checks import InputError
-from erl_torch.mdp import TabularMDP, check_policy
+from erl_torch.certificates import Gains, gains
+from erl_torch.chains import Elimination, RegenerativeLU, SingularChainError, classes, reachable_from
+from erl_torch.mdp import TabularMDP, check_prior
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,10 +36,7 @@ class Problem:
     def of(cls, mdp: TabularMDP, beta: float, prior_policy: Any = None) -> Problem:
         """Restrict ``mdp``. Raises InputError for beta <= 0 or a prior that is 0 somewhere."""
         checks.temperature("beta", beta)
-        prior = check_policy("prior_policy", prior_policy, mdp.n_states, mdp.n_actions)
-        if not (prior > 0).all():
-            s, a = np.argwhere(prior <= 0)[0]
-            raise InputError(f"prior_policy[{s}, {a}]", prior[s, a], "> 0 (leave the action out instead)")
+        prior = check_prior("prior_policy", prior_policy, mdp.n_states, mdp.n_actions)
         p, n_actions = mdp.transition, mdp.n_actions
         mask = reachable_from(state_graph(p, n_actions), mdp.start)
         states = np.flatnonzero(mask)
@@ -60,12 +55,33 @@ class Problem:
 
     @cached_property
     def reward_range(self) -> float:
-        """max r - min r, or max |r| if that is 0, or 1: what tolerances are relative to."""
+        """max r - min r, or max |r| if that is 0, or 1."""
         return float(np.ptp(self.reward)) or float(np.abs(self.reward).max()) or 1.0
 
-    @cached_property
-    def _pair_of_entry(self) -> np.ndarray:
-        return np.repeat(np.arange(self.reward.size), np.diff(self.transition.indptr))
+    def scale_seen(self, policy: np.ndarray, theta: float) -> float:
+        """What tolerances are relative to, reward a step: max(|theta|, mean |r| that ``policy`` [n, A] meets in the
+        long run), but not above the reward range; rewards that it never meets do not count. Where both are 0, the
+        smallest |r| that is not."""
+        seen = abs(theta)
+        # A class that falls apart in double precision: theta alone.
+        with contextlib.suppress(SingularChainError):
+            share = self.regeneration(policy).stationary()
+            seen = max(seen, float(share @ (policy * np.abs(self.reward)).sum(1)))
+        if not seen > 0:
+            size = np.abs(self.reward)
+            seen = float(size[size > 0].min(initial=np.inf))
+        return min(self.reward_range, seen)
+
+    def is_narrow(self, bounds: tuple[float, float], tol: float, policy: np.ndarray) -> bool:
+        """Whether bounds on theta* are as narrow as ``tol`` asks, relative to what the policy behind them sees."""
+        width = bounds[1] - bounds[0]
+        if not width <= tol * self.reward_range:
+            return False
+        return width <= tol * self.scale_seen(policy, 0.5 * (bounds[0] + bounds[1]))
+
+    def gains(self, value: np.ndarray) -> Gains:
+        """TV - V of ``value`` [n], with bounds."""
+        return gains(self.transition, self.reward, self.prior, self.beta, value)
 
     @cached_property
     def classes(self) -> tuple[np.ndarray, np.ndarray]:
@@ -76,15 +92,32 @@ class Problem:
         """r + E V, [n, A]."""
         return np.asarray(self.reward + (self.transition @ value).reshape(self.reward.shape))
 
+    @cached_property
+    def pattern(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """CSR (ptr, ind) of the states that can follow each, and the place of each transition entry in ind."""
+        found: tuple[np.ndarray, np.ndarray, np.ndarray] = kernels.state_pattern(
+            self.transition.indptr, self.transition.indices, self.n_actions
+        )
+        return found
+
+    @cached_property
+    def elimination(self) -> Elimination:
+        """Of all its chains."""
+        return Elimination.of(*self.pattern[:2])
+
     def chain(self, policy: np.ndarray, tilted: np.ndarray | None = None) -> sp.csr_array:
         """CSR [n, n] of ``policy`` [n, A]; ``tilted`` replaces the transition probabilities, entry by entry."""
-        p = self.transition
-        data = policy.ravel()[self._pair_of_entry] * (p.data if tilted is None else tilted)
-        # Copies: sum_duplicates works in place.
-        rows = p.indptr[:: self.n_actions].copy()
-        chain = sp.csr_array((data, p.indices.copy(), rows), shape=(self.n_states, self.n_states))
-        chain.sum_duplicates()
-        return chain
+        p, (ptr, ind, slot) = self.transition, self.pattern
+        data = np.empty(len(ind))
+        kernels.chain_of(p.data if tilted is None else tilted, slot, policy.reshape(-1), p.indptr, data)
+        return sp.csr_array((data, ind, ptr), shape=(self.n_states, self.n_states))
+
+    def regeneration(self, policy: np.ndarray, ref: int | None = None) -> RegenerativeLU:
+        """The policy's chain, cut at a state where it is often. Raises SingularChainError."""
+        ref = self.regeneration_state() if ref is None else ref
+        if ref is None:
+            raise SingularChainError("several closed classes")
+        return RegenerativeLU.adapted(self.chain(policy), ref, self.elimination)
 
     def tilt(self, h: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(log <exp h> [n*A], KL(tilted || p) [n*A], p exp(h)/<exp h> as CSR data)."""
@@ -109,21 +142,3 @@ def state_graph(transition: sp.csr_array, n_actions: int) -> sp.csr_array:
     graph = sp.csr_array((data, transition.indices.copy(), transition.indptr[::n_actions].copy()), shape=(n, n))
     graph.sum_duplicates()
     return graph
-
-
-def soft_backup(q: np.ndarray, prior: np.ndarray, beta: float) -> tuple[np.ndarray, np.ndarray]:
-    """((1/beta) log sum_a prior exp(beta q) [S], its policy [S, A]); accurate for any beta > 0."""
-    top = q.max(1, keepdims=True)
-    with np.errstate(under="ignore"):
-        gap = beta * (q - top)
-        weight = prior * np.exp(gap)
-        # log1p and expm1: at small beta the logarithm is a small number.
-        backed_up = top[:, 0] + np.log1p((prior * np.expm1(gap)).sum(1)) / beta
-        return backed_up, weight / weight.sum(1, keepdims=True)
-
-
-def theta_bounds(value: np.ndarray, backed_up: np.ndarray, reward: np.ndarray) -> tuple[float, float]:
-    """Two-sided bounds on theta* from V and TV, widened by what rounding can do."""
-    gain = backed_up - value
-    slack = 16 * np.finfo(np.float64).eps * (np.abs(value).max() + np.abs(backed_up).max() + np.abs(reward).max())
-    return float(-gain.max() - slack), float(-gain.min() + slack)

@@ -7,11 +7,10 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
-from erl_torch.chains import RegenerativeLU, SingularChainError
-from erl_torch.evaluation import kl_per_state
+from erl_torch.certificates import objective, policy_gains, soft_backup
 from erl_torch.mdp import check_policy
 from erl_torch.solution import Solution, Status
-from erl_torch.solvers.problem import Problem, soft_backup, theta_bounds
+from erl_torch.solvers.problem import Problem
 
 
 class Sized(Protocol):
@@ -35,13 +34,15 @@ def exact_solution(
     message: str = "",
     k: int | None = None,
 ) -> Solution:
-    """The solution that ``value`` [n] (on the problem's states) stands for; theta is the middle of the bounds."""
+    """The solution that ``value`` [n] (on the problem's states) stands for; theta is the middle of the bounds.
+
+    REDUCIBLE: theta* may differ from state to state, so none is given; the bounds hold for each.
+    """
     beta = problem.beta
     q = problem.action_value(value)
     backed_up, policy = soft_backup(q, problem.prior, beta)
     theta = 0.5 * (bounds[0] + bounds[1])
-    # J(pi_V) is not below the lower end that V itself proves; the bounds may come from another V.
-    gap = theta_bounds(value, backed_up, problem.reward)[1] - bounds[0]
+    gap = policy_gap(problem, policy, bounds, value)
     # log u = beta V + log(pi/prior), so Q = log(u)/beta = V + q - TV.
     action_value = value[:, None] + q - backed_up[:, None]
     shift = max(action_value.max(), value.max())
@@ -51,14 +52,14 @@ def exact_solution(
     delta = float(reward_bias.max())
     with np.errstate(over="ignore", under="ignore"):
         u, psi = np.exp(beta * action_value), np.exp(log_psi)
-        rho = float(np.exp(-beta * (theta + delta)))
+        rho = None if status is Status.REDUCIBLE else float(np.exp(-beta * (theta + delta)))
     prior = check_policy("prior_policy", prior_policy, mdp.n_states, mdp.n_actions)
     return Solution(
         policy=spread(problem, policy, prior),
         u=spread(problem, u, np.ones_like(prior)),
         psi=spread(problem, psi, np.ones(mdp.n_states)),
         rho=rho,
-        theta=theta,
+        theta=None if status is Status.REDUCIBLE else theta,
         reward_bias=spread(problem, reward_bias, np.zeros_like(prior)),
         reward_bias_max=delta,
         n_steps=n_steps,
@@ -79,34 +80,35 @@ def bias(problem: Problem, log_psi: np.ndarray) -> np.ndarray:
     return np.asarray(delta.reshape(problem.reward.shape))
 
 
-def policy_gap(problem: Problem, policy: np.ndarray, bounds: tuple[float, float]) -> float | None:
-    """Upper bound on g* - J(policy), reward a step; None where the policy's chain is not one class."""
-    ref = problem.regeneration_state()
-    if ref is None:
-        return None
-    reward = (policy * problem.reward).sum(1) - kl_per_state(policy, problem.prior) / problem.beta
-    try:
-        gain, _ = RegenerativeLU.adapted(problem.chain(policy), ref).poisson(reward)
-    except SingularChainError:
-        return None
-    slack = 16 * np.finfo(np.float64).eps * (abs(gain) + np.abs(problem.reward).max())
-    return float(max(-bounds[0] - gain, 0.0) + slack)
+def policy_gap(
+    problem: Problem, policy: np.ndarray, bounds: tuple[float, float], value: np.ndarray | None = None
+) -> float:
+    """Upper bound on g* - J(policy) from the start, reward a step, for bounds on theta* = -g*.
+
+    ``value`` [n]: of which the policy is greedy, if it is; its gains then bound J closely enough.
+    """
+    parts = (problem.transition, problem.reward, problem.prior, problem.beta, policy)
+    worth = -np.inf
+    if value is not None:
+        worth = float(policy_gains(*parts, value)[0].min())
+    if value is None or -worth - bounds[0] > 2 * (bounds[1] - bounds[0]):
+        worth = max(worth, objective(*parts, problem.start).low)
+    return max(float(np.nextafter(-bounds[0] - worth, np.inf)), 0.0)
 
 
 def reducible_solution(mdp: Sized, problem: Problem, prior_policy: Any) -> Solution:
     """The best policy and bounds that V = 0 proves, and a message that names the classes."""
     value = np.zeros(problem.n_states)
-    backed_up, _ = soft_backup(problem.action_value(value), problem.prior, problem.beta)
-    bounds = theta_bounds(value, backed_up, problem.reward)
+    bounds = problem.gains(value).theta_bounds
     message = explain_classes(problem)
     return exact_solution(mdp, problem, value, Status.REDUCIBLE, 0, bounds, prior_policy, message)
 
 
 def how_it_ended(
-    problem: Problem, bounds: tuple[float, float], tol: float, steps: int, max_steps: int
+    problem: Problem, bounds: tuple[float, float], policy: np.ndarray, tol: float, steps: int, max_steps: int
 ) -> tuple[Status, str]:
-    """(status, message) of an iteration that has stopped with these bounds on theta*."""
-    if bounds[1] - bounds[0] <= tol * problem.reward_range:
+    """(status, message) of an iteration that has stopped with these bounds on theta* and the policy behind them."""
+    if problem.is_narrow(bounds, tol, policy):
         return Status.CONVERGED, ""
     if steps >= max_steps:
         return Status.STEP_LIMIT, ""

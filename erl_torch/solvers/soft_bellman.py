@@ -15,17 +15,18 @@ every V carries) shows that the solution is near, undiscounted steps finish; whe
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from erl_torch import checks
+from erl_torch.certificates import soft_backup
 from erl_torch.chains import RegenerativeLU, SingularChainError
 from erl_torch.mdp import TabularMDP
 from erl_torch.solution import Solution
-from erl_torch.solvers.problem import Problem, soft_backup, theta_bounds
+from erl_torch.solvers.problem import Problem
 from erl_torch.solvers.result import Sized, exact_solution, how_it_ended, policy_gap, reducible_solution
 
 FIRST_HORIZON = 300.0  # steps
@@ -42,9 +43,9 @@ class BellmanState:
     step: int  # linear systems solved
     horizon: float  # infinite once undiscounted
     value: np.ndarray  # [n], reward
-    backed_up: np.ndarray  # TV, [n]
+    gain: np.ndarray  # TV - V, [n]
     policy: np.ndarray  # pi_V, [n, A]
-    theta_bounds: tuple[float, float]  # on theta* of the undiscounted problem
+    theta_bounds: tuple[float, float]  # on theta* of the undiscounted problem, by this value alone
 
     @property
     def width(self) -> float:
@@ -60,7 +61,8 @@ def solve_soft_bellman(
         mdp: the problem, on the states that its start leads to.
         beta: inverse temperature, 1/reward, > 0.
         prior_policy: [S, A], entries > 0; None is uniform.
-        tol: width of the bounds to stop at, relative to the range of the rewards.
+        tol: width of the bounds to stop at, relative to max(|theta|, mean |r| that the policy meets in the long run)
+            or, where that is less, the range of the rewards.
         max_steps: linear systems at most.
 
     Returns:
@@ -85,13 +87,16 @@ def solve_problem(
     if ref is None:
         return reducible_solution(mdp, problem, prior_policy)
     best = state = None
+    lower, upper = -np.inf, np.inf
     for state in iterate_soft_bellman(problem, ref, tol, max_steps):
+        lower, upper = max(lower, state.theta_bounds[0]), min(upper, state.theta_bounds[1])
         if best is None or state.width < best.width:
             best = state
     assert state is not None
     assert best is not None
-    status, message = how_it_ended(problem, best.theta_bounds, tol, state.step, max_steps)
-    return exact_solution(mdp, problem, best.value, status, state.step, best.theta_bounds, prior_policy, message)
+    bounds = (lower, upper)
+    status, message = how_it_ended(problem, bounds, best.policy, tol, state.step, max_steps)
+    return exact_solution(mdp, problem, best.value, status, state.step, bounds, prior_policy, message)
 
 
 def certify(
@@ -110,28 +115,31 @@ def certify(
 
 
 def iterate_soft_bellman(problem: Problem, ref: int, tol: float, max_steps: int) -> Iterator[BellmanState]:
-    """Yield a state after each Newton step, until the bounds are within ``tol`` or progress ends."""
-    goal = tol * problem.reward_range
+    """Yield a state after each Newton step, until its bounds are as narrow as ``tol`` asks or progress ends."""
+
+    def done(state: BellmanState) -> bool:
+        return problem.is_narrow(state.theta_bounds, tol, state.policy)
+
     state = _state(problem, np.zeros(problem.n_states), 0, 0.0)
     yield state
     horizon, loose, home = FIRST_HORIZON, LOOSE, ref
-    while state.width > goal and state.step < max_steps and horizon <= LAST_HORIZON:
+    while not done(state) and state.step < max_steps and horizon <= LAST_HORIZON:
         discount = 1 - 1 / horizon
         for once in range(50):
             backed_up, policy = soft_backup(problem.action_value(discount * state.value), problem.prior, problem.beta)
             error = backed_up - state.value
             if state.step >= max_steps or (once and np.ptp(error) <= loose * problem.reward_range):
                 break
-            lu = RegenerativeLU(problem.chain(policy), home, discount)
+            lu = RegenerativeLU(problem.chain(policy), home, discount, problem.elimination)
             state = _state(problem, state.value + lu.poisson(error, refine=False)[1], state.step + 1, horizon)
             # Where the process spends its time within the horizon: a state to come back to.
             ref = int(np.argmax(lu.stationary()))
             yield state
-            if state.width <= goal:
+            if done(state):
                 return
         if state.width < NEAR * problem.reward_range or horizon > 1e6:
             best, steps = state, state.step
-            for new in _undiscounted(problem, state, ref, goal, max_steps):
+            for new in _undiscounted(problem, state, ref, done, max_steps):
                 yield new
                 steps = new.step
                 best = new if new.width < best.width else best
@@ -141,19 +149,19 @@ def iterate_soft_bellman(problem: Problem, ref: int, tol: float, max_steps: int)
 
 
 def _undiscounted(
-    problem: Problem, state: BellmanState, ref: int, goal: float, max_steps: int
+    problem: Problem, state: BellmanState, ref: int, done: Callable[[BellmanState], bool], max_steps: int
 ) -> Iterator[BellmanState]:
-    """Newton steps from ``state`` until the bounds are within ``goal``, or have not halved in three steps."""
+    """Newton steps from ``state`` until its bounds are ``done``, or have not halved in three steps."""
     widths = [state.width]
     lu: RegenerativeLU | None = None
-    while widths[-1] > goal and state.step < max_steps:
+    while not done(state) and state.step < max_steps:
         if len(widths) > 3 and min(widths[-3:]) > 0.5 * min(widths[:-3]):
             return
         new = _newton(problem, state, lu) if lu else None
         # The factors of an earlier step will do where they still gain two digits.
         if new is None or not new.width < 0.01 * state.width:
             try:
-                lu = RegenerativeLU.adapted(problem.chain(state.policy), ref)
+                lu = problem.regeneration(state.policy, ref)
             except SingularChainError:
                 return
             ref = lu.ref
@@ -166,10 +174,10 @@ def _undiscounted(
 
 
 def _newton(problem: Problem, state: BellmanState, lu: RegenerativeLU) -> BellmanState:
-    value = state.value + lu.poisson(state.backed_up - state.value)[1]
+    value = state.value + lu.poisson(state.gain)[1]
     return _state(problem, value - value[lu.ref], state.step + 1, np.inf)
 
 
 def _state(problem: Problem, value: np.ndarray, step: int, horizon: float) -> BellmanState:
-    backed_up, policy = soft_backup(problem.action_value(value), problem.prior, problem.beta)
-    return BellmanState(step, horizon, value, backed_up, policy, theta_bounds(value, backed_up, problem.reward))
+    found = problem.gains(value)
+    return BellmanState(step, horizon, value, found.gain, found.policy, found.theta_bounds)
