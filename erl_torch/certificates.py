@@ -11,7 +11,7 @@ distribution; and of all policies pi_V has the largest such reward in every stat
 
 The compiled rows (``kernels.gain_rows``, ``kernels.policy_gain_rows``) return each gain with a lower and an upper end
 that rounding cannot leave: E V - V(s) is a sum of p (V(s') - V(s)) over s' other than s, so that no digit is lost where
-a state is rarely left, and the error of an action counts as far as it is chosen. docs/theory.md, 5, has every operation.
+a state is rarely left, and the error of an action counts as far as it is chosen (docs/theory.md, 6: every operation).
 The rows of transition, prior and policy are meant as divided by their sums, which are 1 but for rounding.
 """
 

@@ -104,7 +104,7 @@ class Elimination:
     @cached_property
     def column(self) -> np.ndarray:
         """Rank of the successor, entry by entry."""
-        return self.rank[self.ind]
+        return np.asarray(self.rank[self.ind])
 
 
 class _CompiledLU:
@@ -116,7 +116,21 @@ class _CompiledLU:
         low, up, diagonal = np.empty(lind.size), np.empty(uind.size), np.empty(n)
         at = int(e.rank[ref])
         kernels.cut_lu(
-            e.ptr, e.column, data, e.order, at, leak, lptr, lind, uptr, uind, low, up, diagonal, np.empty(n), np.zeros(n)
+            e.ptr,
+            e.column,
+            data,
+            e.order,
+            at,
+            leak,
+            lptr,
+            lind,
+            uptr,
+            uind,
+            low,
+            up,
+            diagonal,
+            np.empty(n),
+            np.zeros(n),
         )
         self._elimination, self._data, self._ref = e, data, at
         self._factors = (lptr, lind, uptr, uind, low, up, diagonal)
@@ -124,14 +138,14 @@ class _CompiledLU:
     def solve(self, x: np.ndarray) -> np.ndarray:
         ranked = x[self._elimination.order]
         kernels.cut_solve(*self._factors, ranked)
-        return ranked[self._elimination.rank]
+        return np.asarray(ranked[self._elimination.rank])
 
     def visits(self) -> np.ndarray:
         """Expected visits to each state between two to ``ref``, [n]."""
         e = self._elimination
         ranked = np.empty(len(e.rank))
         kernels.cut_share(e.ptr, e.column, self._data, e.order, self._ref, *self._factors, ranked)
-        return ranked[e.rank]
+        return np.asarray(ranked[e.rank])
 
 
 class _SuperLU:
@@ -295,7 +309,7 @@ def stationary(chain: sp.csr_array, dense: bool = False) -> Share:
 
 
 def _dense_stationary(chain: sp.csr_array) -> Share | None:
-    """By dense elimination, S^3/3 steps, with the error that rounding can have made (docs/theory.md, 5); None where
+    """By dense elimination, S^3/3 steps, with the error that rounding can have made (docs/theory.md, 6); None where
     products of probabilities leave double precision."""
     n = chain.shape[0]
     if n == 1:

@@ -774,7 +774,7 @@ def gth(p):
     """(stationary distribution [S], whether its digits can be trusted) of one closed class, dense p [S, S] (destroyed).
 
     Grassmann, Taksar, Heyman (1985): no subtraction, the diagonal is not read, and every component comes out to nearly
-    full relative accuracy, however rarely the chain moves between its parts (docs/theory.md, 5). Not to be trusted:
+    full relative accuracy, however rarely the chain moves between its parts (docs/theory.md, 6). Not to be trusted:
     a product has left the range of normal numbers.
     """
     n = p.shape[0]
@@ -825,7 +825,7 @@ def gth(p):
 
 
 # ---------------------------------------------------------------------------------------------------
-# Certificates: one-step gains with what rounding can have done to them (docs/theory.md, 5)
+# Certificates: one-step gains with what rounding can have done to them (docs/theory.md, 6)
 # ---------------------------------------------------------------------------------------------------
 
 

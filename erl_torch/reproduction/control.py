@@ -113,6 +113,8 @@ def _extrapolated(iterates: np.ndarray) -> np.ndarray:
     """Reduced rank extrapolation of iterates [w, n]: the affine combination with the smallest step; maximum 0."""
     steps = np.diff(iterates, axis=0)
     gram = steps @ steps.T
+    if not np.trace(gram) > 0:  # nothing moves any more
+        return np.asarray(iterates[-1] - iterates[-1].max())
     gram += 1e-14 * np.trace(gram) * np.eye(len(gram))
     weight = np.linalg.solve(gram, np.ones(len(gram)))
     h = (weight / weight.sum()) @ iterates[1:]

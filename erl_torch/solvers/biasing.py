@@ -20,7 +20,7 @@ solved as the old problem and so hands its value over as the start.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -88,7 +88,10 @@ def solve_biasing(
     checks.positive("tol", tol)
     problem = _problem(mdp, beta, prior_policy, target)
     if len(problem.classes[1]) > 1:
-        return reducible_solution(target or mdp, problem, prior_policy)
+        found = reducible_solution(target or mdp, problem, prior_policy)
+        if problem.classes[1].sum() > 1:
+            return found
+        return replace(found, message=f"{found.message}. Soft policy iteration needs one closed set only")
     k: int | None = None
     state: BiasingState | None = None
     for state in iterate_biasing(mdp, beta, prior_policy, target, max_steps):

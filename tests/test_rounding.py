@@ -1,0 +1,279 @@
+"""Bounds in floating point against many digits: mpmath and fractions, straight from the equations."""
+
+from dataclasses import replace
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+import torch
+from conftest import random_mdp, random_policy
+from mpmath import mp, mpf
+
+from erl_torch import InputError, Status, TabularMDP, certify, solve_biasing, solve_soft_bellman
+from erl_torch.certificates import gains, objective, policy_gains
+from erl_torch.chains import RegenerativeLU, SingularChainError, long_run
+from erl_torch.evaluation import Judge
+from erl_torch.evaluation import objective as worth
+from erl_torch.notes import Note
+
+
+@pytest.fixture(autouse=True)
+def digits():
+    with mp.workdps(60):
+        yield
+
+
+def hostile(rng):
+    """(transition [S*A, S], reward, prior [S, A], beta): small probabilities, small priors, rewards of all sizes."""
+    n_states, n_actions = int(rng.integers(1, 5)), int(rng.integers(1, 4))
+    p = rng.dirichlet(np.full(n_states, 0.5), n_states * n_actions) + 1e-300
+    p *= 10.0 ** rng.uniform(-40, 0, p.shape)
+    p[np.arange(len(p)), np.arange(len(p)) // n_actions] += rng.random() < 0.5
+    prior = 10.0 ** (rng.uniform(-20, 0, (n_states, n_actions)) * rng.integers(0, 2))
+    reward = rng.normal(size=prior.shape) * 10.0 ** rng.uniform(-6, 9, prior.shape)
+    mdp = TabularMDP(p, reward, normalise=True)
+    prior = prior / prior.sum(1, keepdims=True)
+    return mdp.transition, reward, prior, 10.0 ** rng.uniform(-12, 4)
+
+
+def exact(transition, reward, value, s, a):
+    """r + E V - V(s), the row divided by its sum."""
+    row = slice(*transition.indptr[s * reward.shape[1] + a :][:2])
+    p = [mpf(x) for x in transition.data[row]]
+    mean = sum(x * mpf(value[j]) for x, j in zip(p, transition.indices[row], strict=True)) / sum(p)
+    return mpf(reward[s, a]) + mean - mpf(value[s])
+
+
+@pytest.mark.filterwarnings("ignore::erl_torch.notes.Note")
+def test_gains_lie_between_their_ends():
+    """TV - V for any V, to 60 digits; and the ends are close where no digit is lost in q itself."""
+    rng = np.random.default_rng(0)
+    for _ in range(400):
+        transition, reward, prior, beta = hostile(rng)
+        value = rng.normal(size=len(reward)) * 10.0 ** rng.uniform(-6, 12)
+        found = gains(transition, reward, prior, beta, value)
+        for s in range(len(reward)):
+            q = [exact(transition, reward, value, s, a) for a in range(reward.shape[1])]
+            top = max(q)
+            weights = [mpf(x) for x in prior[s]]
+            mean = sum(w * mp.exp(mpf(beta) * (x - top)) for w, x in zip(weights, q, strict=True)) / sum(weights)
+            gain = top + mp.log(mean) / mpf(beta)
+            assert mpf(found.low[s]) <= gain <= mpf(found.high[s])
+            scale = max(abs(x) for x in q) + np.abs(reward[s]).max() + np.ptp(value)
+            assert found.high[s] - found.low[s] <= 1e-13 * scale + 1e-310
+
+
+@pytest.mark.filterwarnings("ignore::erl_torch.notes.Note")
+def test_policy_gains_lie_between_their_ends():
+    rng = np.random.default_rng(1)
+    for case in range(400):
+        transition, reward, prior, beta = hostile(rng)
+        value = rng.normal(size=len(reward)) * 10.0 ** rng.uniform(-6, 12)
+        policy = random_policy(rng, *reward.shape)
+        if case % 3 == 0:  # close to the prior: KL is of second order
+            policy = prior * (1 + 10.0 ** rng.uniform(-15, -1) * rng.normal(size=prior.shape) / 8)
+            policy /= policy.sum(1, keepdims=True)
+        if case % 3 == 1:
+            policy = np.eye(reward.shape[1])[rng.integers(0, reward.shape[1], len(reward))]
+        low, high = policy_gains(transition, reward, prior, beta, policy, value)
+        for s in range(len(reward)):
+            pi, of_prior = [mpf(x) for x in policy[s]], [mpf(x) for x in prior[s]]
+            gain = mpf(0)
+            for a, x in enumerate(pi):
+                if x > 0:
+                    ratio = (x / sum(pi)) / (of_prior[a] / sum(of_prior))
+                    gain += x / sum(pi) * (exact(transition, reward, value, s, a) - mp.log(ratio) / mpf(beta))
+            assert mpf(low[s]) <= gain <= mpf(high[s])
+
+
+def rational_shares(chain):
+    """Stationary distribution of a dense chain, by elimination in fractions from the off-diagonal entries."""
+    n = len(chain)
+    p = [[Fraction(float(x)) for x in row] for row in chain]
+    for k in range(n - 1, 0, -1):
+        out = sum(p[k][:k])
+        for i in range(k):
+            p[i][k] /= out
+            for j in range(k):
+                p[i][j] += p[i][k] * p[k][j]
+    x = [Fraction(1)]
+    for k in range(1, n):
+        x.append(sum(x[i] * p[i][k] for i in range(k)))
+    return [v / sum(x) for v in x]
+
+
+def test_shares_of_time_are_as_accurate_as_said():
+    rng = np.random.default_rng(2)
+    worst = 0.0
+    for _ in range(60):
+        n = int(rng.integers(2, 8))
+        chain = rng.random((n, n)) * 10.0 ** (-150 * rng.random((n, n)) ** 2)
+        share = long_run(sp.csr_array(chain), np.full(n, 1 / n))
+        assert share.relative_error < 1e-12
+        for found, true in zip(share.of_state, rational_shares(chain), strict=True):
+            worst = max(worst, abs(float(Fraction(float(found)) / true - 1)) / share.relative_error)
+    assert worst <= 1
+
+
+def test_endings_of_a_chain_with_several_classes():
+    """0 leaves for the closed sets {1} and {2, 3} with probabilities e and 2e, whatever e: shares 1/3 and 2/3."""
+    for e in (0.1, 1e-20, 1e-200):
+        chain = np.array([[1 - 3 * e, e, 2 * e, 0], [0, 1, 0, 0], [0, 0, 0.5, 0.5], [0, 0, 0.25, 0.75]])
+        share = long_run(sp.csr_array(chain), np.eye(4)[0])
+        np.testing.assert_allclose(share.of_state, [0, 1 / 3, 2 / 9, 4 / 9], rtol=1e-15)
+
+
+@pytest.mark.parametrize("n_states", [4, 130])
+@pytest.mark.parametrize("e", [1e-3, 1e-12, 1e-17, 1e-100])
+@pytest.mark.filterwarnings("ignore::erl_torch.notes.Note")
+def test_worth_of_a_policy_lies_between_its_bounds(n_states, e):
+    """Two cycles, joined by weights e and 3 e beside the 1 of the way round; worth 0 and 1: J in closed form."""
+    half = n_states // 2
+    chain = np.zeros((n_states, n_states))
+    for part in (range(half), range(half, n_states)):
+        for i, s in enumerate(part):
+            chain[s, part[(i + 1) % half]] = 1.0
+    chain[0, half], chain[half, 0] = e, 3 * e
+    reward = np.zeros((n_states, 1))
+    reward[half:] = 1.0
+    mdp = TabularMDP(chain, reward, normalise=True)
+    one = np.ones((n_states, 1))
+    found = objective(mdp.transition, mdp.reward, one, 1.0, one, mdp.start)
+    # At the joints the flows both ways are equal; a cycle's other states get what the joint sends round.
+    weights = Fraction(e), Fraction(3 * e)
+    joint = [(1 + w) / w for w in weights]
+    there, here = (d * (1 + (half - 1) / (1 + w)) for d, w in zip(joint, weights, strict=True))
+    true = here / (here + there)
+    rounding = true / 10**15  # of the rows' division on entry
+    assert Fraction(found.low) <= true + rounding
+    assert true - rounding <= Fraction(found.high)
+    assert found.high - found.low < 1e-9
+    assert found.low <= found.value <= found.high
+
+
+def test_two_routes_to_the_same_worth_have_the_same_bits():
+    rng = np.random.default_rng(4)
+    for _ in range(30):
+        mdp, prior, policy = random_mdp(rng, 9, 3), random_policy(rng, 9, 3), random_policy(rng, 9, 3)
+        assert Judge(mdp, prior, 10).objective(policy, 2.0) == worth(mdp, policy, prior, 2.0)
+
+
+# -- the faults, in closed form -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("solve", [solve_soft_bellman, solve_biasing])
+@pytest.mark.parametrize(
+    ("small", "beta", "reward"),
+    [
+        (1e-6, 1.0, 100.0),
+        (1e-12, 1.0, 100.0),
+        (1e-15, 1e-2, 1e4),
+        (1e-16, 1.0, 1e3),
+        (1e-300, 1.0, 1e3),
+        (1e-9, 1e-8, 1.0),
+    ],
+)
+def test_bounds_where_the_best_action_has_little_prior(solve, small, beta, reward):
+    prior = np.array([[small, 1 - small]])
+    found = solve(TabularMDP(np.ones((1, 2, 1)), [[reward, 0.0]]), beta, prior)
+    a, b = mpf(prior[0, 0]), mpf(prior[0, 1])
+    theta = -mp.log((a * mp.exp(mpf(beta) * reward) + b) / (a + b)) / mpf(beta)
+    assert mpf(found.theta_bounds[0]) <= theta <= mpf(found.theta_bounds[1])
+
+
+def test_loss_of_a_policy_that_nearly_stays_put():
+    """Two states; action 0 leaves with probability e0 or e1, action 1 moves with 1/2: the worth of 'always 0'."""
+    rng = np.random.default_rng(0)
+    for _ in range(100):
+        e = 10.0 ** rng.uniform(-300, -3) * np.array([1.0, rng.uniform(0.3, 3)])
+        t = np.full((2, 2, 2), 0.5)
+        t[0, 0], t[1, 0] = (1 - e[0], e[0]), (e[1], 1 - e[1])
+        mdp = TabularMDP(t, [[0.0, 0.0], [1.0, 1.0]])
+        best = solve_soft_bellman(mdp, 1.0)
+        policy = np.array([[1.0, 0.0], [1.0, 0.0]])
+        gap = certify(replace(best, policy=torch.from_numpy(policy)), mdp, 1.0, best=best).gap
+        e0, e1 = Fraction(float(t[0, 0, 1])), Fraction(float(t[1, 0, 0]))
+        e0 /= Fraction(float(t[0, 0, 0])) + e0
+        e1 /= Fraction(float(t[1, 0, 1])) + e1
+        share = e0 / (e0 + e1)
+        true = mpf(share.numerator) / mpf(share.denominator) - mp.log(2)
+        assert mpf(gap) >= -mpf(best.theta_bounds[1]) - true
+        assert gap <= float(-best.theta_bounds[0] - true) + 1e-12
+
+
+@pytest.mark.parametrize("penalty", [1e3, 1e9, 1e12])
+def test_a_penalty_that_is_never_paid_loosens_nothing(penalty):
+    """State 1 has an action that costs 1e12: theta* is that of the problem in which its weight is 0."""
+    t = np.array([[[0.5, 0.5], [0.0, 1.0]], [[0.1, 0.9], [0.1, 0.9]]])
+    mdp = TabularMDP(t, [[5.0, 10.0], [-2.0, -penalty]])
+    value = [mpf(0), mpf(0)]
+    for _ in range(3000):  # relative value iteration, half a step at a time; at the end 40 digits
+        q = [[5 + (value[0] + value[1]) / 2, 10 + value[1]], [-2 + value[0] / 10 + 9 * value[1] / 10]]
+        new = [mp.log(sum(mp.exp(x) / 2 for x in row)) for row in q]
+        gain = [new[s] - value[s] for s in range(2)]
+        value = [(value[s] + new[s]) / 2 - (value[0] + new[0]) / 2 for s in range(2)]
+    assert abs(gain[0] - gain[1]) < mpf(10) ** -15
+    for solve in (solve_soft_bellman, solve_biasing):
+        found = solve(mdp, 1.0)
+        assert found.status is Status.CONVERGED
+        assert found.theta == pytest.approx(float(-gain[0]), abs=2e-9)
+        assert found.theta_bounds[0] <= -gain[0] + mpf(10) ** -14
+        assert -gain[0] - mpf(10) ** -14 <= found.theta_bounds[1]
+
+
+# -- what goes in -----------------------------------------------------------------------------------------------
+
+
+def test_rows_of_single_precision_are_welcome_and_named():
+    rng = np.random.default_rng(5)
+    p = rng.dirichlet(np.ones(5), (5, 3)).astype(np.float32)
+    start = p[0, 0]
+    with pytest.warns(Note, match="rows of transition and start did not sum to 1, by up to"):
+        mdp = TabularMDP(p, np.zeros((5, 3)), start)
+    np.testing.assert_allclose(mdp.transition.sum(axis=1), 1, atol=4e-16)
+    np.testing.assert_allclose(mdp.transition.toarray().reshape(5, 3, 5), p.astype(float), rtol=3e-7)
+    with pytest.warns(Note, match="rows of prior_policy"):
+        solve_soft_bellman(mdp, 1.0, rng.dirichlet(np.ones(3), 5).astype(np.float32))
+    with pytest.raises(InputError, match=r"transition row 1 \(state 0, action 1\)=sum 2: must be 1 in sum, within"):
+        TabularMDP([[[1.0], [2.0]]], [[0.0, 0.0]])
+    with pytest.warns(Note):
+        scaled = TabularMDP([[[1.0], [2.0]]], [[0.0, 0.0]], normalise=True)
+    np.testing.assert_array_equal(scaled.transition.toarray(), 1.0)
+    with pytest.raises(InputError, match="of a finite sum > 0"):
+        TabularMDP([[[1.0], [0.0]]], [[0.0, 0.0]], normalise=True)
+
+
+def test_rows_that_are_right_keep_their_bits():
+    p = np.array([[1 / 3, 1 / 3, 1 / 3], [0.1, 0.2, 0.7], [0.25, 0.25, 0.5]])
+    np.testing.assert_array_equal(TabularMDP(p, np.zeros((3, 1))).transition.toarray(), p)
+
+
+@pytest.mark.parametrize("solve", [solve_soft_bellman, solve_biasing])
+def test_a_printed_table_is_solved_as_its_normalised_rows(solve):
+    """1/3 with eight digits, three times: the bounds are those of rows that sum to 1."""
+    n = 50
+    third = 0.33333333
+    given = np.zeros((n, n))
+    for s in range(n):
+        for to in (min(s + 1, n - 1), max(s - 1, 0), s):
+            given[s, to] += third
+    reward = np.zeros((n, 1))
+    reward[-1] = 1.0
+    with pytest.warns(Note, match="by up to 1.0e-08"):
+        found = solve(TabularMDP(given, reward), 1.0)
+    assert found.theta_bounds[0] <= -1 / n <= found.theta_bounds[1]
+
+
+def test_indices_out_of_range_are_named():
+    p = sp.csr_array((np.ones(2), np.array([0, 1]), np.array([0, 1, 2])), shape=(2, 2))
+    p.indices = np.array([0, 700_000_000], np.int32)
+    with pytest.raises(InputError, match="indices in range"):
+        TabularMDP(p, np.ones((2, 1)))
+
+
+def test_states_that_are_never_left_do_not_reach_superlu(monkeypatch):
+    monkeypatch.setattr("erl_torch.chains.SPARSE_STATES", 0)
+    chain = sp.csr_array(np.array([[0.5, 0.5, 0.0], [0.0, 1.0, 0.0], [0.5, 0.0, 0.5]]))
+    with pytest.raises(SingularChainError):
+        RegenerativeLU(chain, 0)
