@@ -25,6 +25,7 @@ import scipy.sparse as sp
 from erl_torch import kernels
 from erl_torch.chains import (
     EPSILON,
+    GTH_STATES,
     RegenerativeLU,
     Share,
     SingularChainError,
@@ -113,14 +114,17 @@ def objective(
     if not (np.isfinite(low) and np.isfinite(high)):
         return Objective(low, low, high)
     worth = one_step_worth(*within)
-    share = _share(chain, start, dense=False)
+    ends_in = np.unique(label[ends])
+    share = _share(chain, start) if ends.sum() <= GTH_STATES else None
     if share is None or not np.isfinite(share.relative_error):
-        value = _relative_value(chain, worth, label, ends)
+        value, of_one = _by_regeneration(chain, worth, label, ends_in)
         if value is not None:
             again = policy_gains(transition, reward, prior, beta, policy, value)
             low, high = max(low, float(again[0][ends].min())), min(high, float(again[1][ends].max()))
+        share = share or of_one
         if high - low > SHARP * max(abs(low), abs(high)):
             share = _share(chain, start, dense=True) or share
+        share = share or _share(chain, start)
     if share is None:
         return Objective(0.5 * (low + high), low, high)
     d = share.of_state[ends]
@@ -136,7 +140,7 @@ def objective(
     return Objective(found, min(low, found), max(high, found))
 
 
-def _share(chain: sp.csr_array, start: np.ndarray, dense: bool) -> Share | None:
+def _share(chain: sp.csr_array, start: np.ndarray, dense: bool = False) -> Share | None:
     try:
         return long_run(chain, start, dense)
     except SingularChainError:
@@ -150,14 +154,21 @@ def one_step_worth(low: np.ndarray, high: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(middle), middle, 0.0)
 
 
-def _relative_value(chain: sp.csr_array, worth: np.ndarray, label: np.ndarray, ends: np.ndarray) -> np.ndarray | None:
-    """Relative value [S] of one-step rewards on each closed class in ``ends``, 0 elsewhere; None where it fails."""
-    value = np.zeros(len(worth))
-    for c in np.unique(label[ends]):
+def _by_regeneration(
+    chain: sp.csr_array, worth: np.ndarray, label: np.ndarray, ends_in: np.ndarray
+) -> tuple[np.ndarray | None, Share | None]:
+    """(relative value [S] of one-step rewards on the closed classes ``ends_in``, 0 elsewhere; the shares of time, if it
+    is one class); None where they cannot be had."""
+    value, share = np.zeros(len(worth)), None
+    for c in ends_in:
         inside = np.flatnonzero(label == c)
         try:
             lu = RegenerativeLU.adapted(sp.csr_array(chain[inside][:, inside]), 0)
         except SingularChainError:
-            return None
+            return None, None
         value[inside] = lu.poisson(worth[inside])[1]
-    return value
+        if len(ends_in) == 1:
+            of_state = np.zeros(len(worth))
+            of_state[inside] = lu.stationary()
+            share = Share(of_state, np.inf)
+    return value, share

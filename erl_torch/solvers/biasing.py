@@ -198,7 +198,8 @@ def _eigenvector(
         backed_up, choice = soft_backup(log_weight + log_mean.reshape(log_weight.shape), problem.prior, 1.0)
         return backed_up, problem.chain(choice, tilted)
 
-    return solve_log_perron(tilt, np.zeros(problem.n_states), RTOL, MAX_NEWTON_STEPS)
+    start = np.zeros(problem.n_states)
+    return solve_log_perron(tilt, start, RTOL, MAX_NEWTON_STEPS, elimination=problem.elimination)
 
 
 def _kl_to(problem: Problem, at: Problem, tilted: np.ndarray) -> np.ndarray:

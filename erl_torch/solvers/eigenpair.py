@@ -92,9 +92,14 @@ def perron(matrix: Any, rtol: float = 1e-13, max_steps: int = 60) -> PerronPair:
 
 
 def solve_log_perron(
-    tilt: Tilt, h: np.ndarray, rtol: float, max_steps: int, power_steps: int = LOG_POWER_STEPS
+    tilt: Tilt,
+    h: np.ndarray,
+    rtol: float,
+    max_steps: int,
+    power_steps: int = LOG_POWER_STEPS,
+    elimination: Elimination | None = None,
 ) -> tuple[np.ndarray, tuple[float, float], Status, int]:
-    """(h, bounds on log rho, status, Newton steps) of M exp(h) = rho exp(h)."""
+    """(h, bounds on log rho, status, Newton steps) of M exp(h) = rho exp(h); ``elimination``: its pattern's, if known."""
 
     def bounds_of(gain: np.ndarray) -> tuple[float, float]:
         slack = 8 * np.finfo(np.float64).eps * (1 + np.abs(h).max() + np.abs(gain).max())
@@ -112,7 +117,7 @@ def solve_log_perron(
     best, best_bounds = h, bounds_of(gain)
     refused, before = 0, np.inf
     lu: RegenerativeLU | None = None
-    elimination = Elimination.of(chain.indptr, chain.indices)  # the pattern stays
+    elimination = elimination or Elimination.of(chain.indptr, chain.indices)
     for step in range(max_steps + 1):
         spread = np.ptp(gain)
         rounding = 64 * np.finfo(np.float64).eps * (1 + np.abs(h).max() + np.abs(gain).max())

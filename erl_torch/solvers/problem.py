@@ -74,10 +74,11 @@ class Problem:
 
     def is_narrow(self, bounds: tuple[float, float], tol: float, policy: np.ndarray) -> bool:
         """Whether bounds on theta* are as narrow as ``tol`` asks, relative to what the policy behind them sees."""
-        width = bounds[1] - bounds[0]
+        width, theta = bounds[1] - bounds[0], 0.5 * (bounds[0] + bounds[1])
         if not width <= tol * self.reward_range:
             return False
-        return width <= tol * self.scale_seen(policy, 0.5 * (bounds[0] + bounds[1]))
+        # The second test takes an LU.
+        return width <= tol * abs(theta) or width <= tol * self.scale_seen(policy, theta)
 
     def gains(self, value: np.ndarray) -> Gains:
         """TV - V of ``value`` [n], with bounds."""
