@@ -101,6 +101,7 @@ class Mdp:
     id: str = "erl_torch/TabularMDP-v0"
     suggest: Suggest = field(default_factory=Suggest)
     path: str = MISSING
+    normalise: bool = False
 
 
 @dataclass

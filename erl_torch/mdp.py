@@ -92,9 +92,9 @@ class TabularMDP:
         return write_npz(path, {**parts, "reward": self.reward, "start": self.start})
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> TabularMDP:
+    def load(cls, path: str | os.PathLike[str], normalise: bool = False) -> TabularMDP:
         """Read what ``save`` wrote, or any npz with ``transition`` (or its CSR parts), ``reward`` and, if not
-        uniform, ``start``. Raises InputError naming the file."""
+        uniform, ``start``; ``normalise`` as in the constructor. Raises InputError naming the file."""
         arrays = read_npz(path)
         parts = [f"transition_{name}" for name in CSR_PARTS]
         if "reward" not in arrays or not ("transition" in arrays or all(part in arrays for part in parts)):
@@ -103,7 +103,7 @@ class TabularMDP:
             transition = arrays.get("transition")
             if transition is None:
                 transition = _csr_of_parts([arrays[part] for part in parts], arrays["reward"].shape)
-            return cls(transition, arrays["reward"], arrays.get("start"))  # type: ignore[arg-type]
+            return cls(transition, arrays["reward"], arrays.get("start"), normalise)  # type: ignore[arg-type]
         except InputError as error:
             raise InputError(f"{path}: {error.key}", error.value, error.allowed) from error
 

@@ -91,16 +91,16 @@ class TabularFileEnv(TabularEnv):
     None. The registered environment truncates after 1000 steps.
 
     ## Arguments
-    `path` (of the npz file; needed), `render_mode` ("ansi").
+    `path` (of the npz file; needed), `normalise` (False: rows far from sum 1 are refused), `render_mode` ("ansi").
 
     ## Version History
     v0: first version.
     """
 
-    def __init__(self, path: str | None = None, render_mode: str | None = None) -> None:
+    def __init__(self, path: str | None = None, normalise: bool = False, render_mode: str | None = None) -> None:
         if path is None:
             raise InputError("path", None, "given: an npz file with transition, reward and start")
-        super().__init__(TabularMDP.load(path), render_mode)
+        super().__init__(TabularMDP.load(path, normalise), render_mode)
 
 
 class GridWorldEnv(TabularEnv):

@@ -99,7 +99,7 @@ def solve_log_perron(
     power_steps: int = LOG_POWER_STEPS,
     elimination: Elimination | None = None,
 ) -> tuple[np.ndarray, tuple[float, float], Status, int]:
-    """(h, bounds on log rho, status, Newton steps) of M exp(h) = rho exp(h); ``elimination``: its pattern's, if known."""
+    """(h, bounds on log rho, status, Newton steps) of M exp(h) = rho exp(h); ``elimination`` of its pattern."""
 
     def bounds_of(gain: np.ndarray) -> tuple[float, float]:
         slack = 8 * np.finfo(np.float64).eps * (1 + np.abs(h).max() + np.abs(gain).max())
