@@ -17,8 +17,8 @@ from erl_torch.mdp import TabularMDP, check_policy
 from erl_torch.solution import Solution, Status
 from erl_torch.solvers.biasing import KL_TOLERANCE, BiasingState, iterate_biasing, solve_biasing
 from erl_torch.solvers.problem import Problem
-from erl_torch.solvers.result import bias, exact_solution, how_it_ended, reducible_solution, spread
-from erl_torch.solvers.soft_bellman import BellmanState, iterate_soft_bellman, solve_soft_bellman
+from erl_torch.solvers.result import bias, ended, reducible_solution, spread
+from erl_torch.solvers.soft_bellman import BellmanState, iterate_soft_bellman, polish, solve_soft_bellman
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,18 +123,11 @@ class Exact:
         if not len(state.value):  # no iteration could be made
             return reducible_solution(mdp, problem, self.prior_policy)
         below = [i for i, row in enumerate(history) if row["kl_max"] < KL_TOLERANCE]
-        status, message = how_it_ended(
-            problem, state.theta_bounds, state.policy.numpy()[problem.states], self.tol, state.step, self.max_steps
-        )
-        solution = exact_solution(
-            mdp,
-            problem,
-            state.value,
-            Status.STOPPED if stopped else status,
-            state.step,
-            state.theta_bounds,
-            self.prior_policy,
-            message,
-            k=below[0] if below and self.method == "biasing" else None,
-        )
+        k = below[0] if below and self.method == "biasing" else None
+        value, bounds = state.value, state.theta_bounds
+        if not stopped and state.step < self.max_steps:
+            value, bounds = polish(problem, value, bounds, self.tol)
+        solution = ended(mdp, problem, value, bounds, self.tol, state.step, self.max_steps, self.prior_policy, k)
+        if stopped:
+            solution = replace(solution, status=Status.STOPPED, message="")
         return replace(solution, history={name: np.array([row[name] for row in history]) for name in history[0]})

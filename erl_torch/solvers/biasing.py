@@ -34,7 +34,8 @@ from erl_torch.solution import Solution, Status
 from erl_torch.solvers.compiled import NewtonPattern
 from erl_torch.solvers.eigenpair import solve_log_perron
 from erl_torch.solvers.problem import Problem
-from erl_torch.solvers.result import bias, exact_solution, explain_classes, how_it_ended, reducible_solution
+from erl_torch.solvers.result import bias, ended, explain_classes, reducible_solution
+from erl_torch.solvers.soft_bellman import polish
 
 KL_TOLERANCE = 1e-6
 RTOL = 1e-13  # spread of the bounds on an eigenvalue
@@ -74,10 +75,11 @@ def solve_biasing(
         target: the MDP to be solved, if it is not ``mdp`` itself: same shapes, its dynamics and rewards count.
         tol: width of the bounds on theta* to stop at, as in ``solve_soft_bellman``.
         max_steps: biasing iterations at most.
-        stop: "certificate", or "kl": at iteration k already.
+        stop: "certificate", or "kl": at iteration k already (status STOPPED, unless the bounds are narrow by then).
 
     Returns:
-        A Solution with ``k`` (None if the KL test never held) and the certificate. Status REDUCIBLE, and no theta,
+        A Solution with ``k`` (None if the KL test never held) and the certificate, which the last value carries after
+        a few Newton steps where its rounding alone keeps the bounds apart. Status REDUCIBLE, and no theta,
         where the states that the start leads to are not one class: the eigenvector needs that
         (``solve_soft_bellman`` needs less, and the message says where it will do).
 
@@ -100,10 +102,15 @@ def solve_biasing(
         if problem.is_narrow(state.theta_bounds, tol, state.policy) or (stop == "kl" and k is not None):
             break
     assert state is not None
-    status, _ = how_it_ended(problem, state.theta_bounds, state.policy, tol, state.k + 1, max_steps)
-    return exact_solution(
-        target or mdp, problem, state.value, status, state.k + 1, state.theta_bounds, prior_policy, k=k
-    )
+    if stop == "kl" and k is not None:
+        found = ended(target or mdp, problem, state.value, state.theta_bounds, tol, k + 1, max_steps, prior_policy, k)
+        if found.status is not Status.CONVERGED:
+            found = replace(found, status=Status.STOPPED, message="at the first iteration with KL < 1e-6, as asked for")
+        return found
+    value, bounds = state.value, state.theta_bounds
+    if state.k + 1 < max_steps:
+        value, bounds = polish(problem, value, bounds, tol)
+    return ended(target or mdp, problem, value, bounds, tol, state.k + 1, max_steps, prior_policy, k)
 
 
 def iterate_biasing(

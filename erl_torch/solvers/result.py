@@ -104,17 +104,28 @@ def reducible_solution(mdp: Sized, problem: Problem, prior_policy: Any) -> Solut
     return exact_solution(mdp, problem, value, Status.REDUCIBLE, 0, bounds, prior_policy, message)
 
 
-def how_it_ended(
-    problem: Problem, bounds: tuple[float, float], policy: np.ndarray, tol: float, steps: int, max_steps: int
-) -> tuple[Status, str]:
-    """(status, message) of an iteration that has stopped with these bounds on theta* and the policy behind them."""
-    if problem.is_narrow(bounds, tol, policy):
-        return Status.CONVERGED, ""
-    if steps >= max_steps:
-        return Status.STEP_LIMIT, ""
-    if len(problem.classes[1]) > 1:
-        return Status.REDUCIBLE, explain_classes(problem)
-    return Status.STAGNATED, ""
+def ended(
+    mdp: Sized,
+    problem: Problem,
+    value: np.ndarray,
+    bounds: tuple[float, float],
+    tol: float,
+    steps: int,
+    max_steps: int,
+    prior_policy: Any = None,
+    k: int | None = None,
+) -> Solution:
+    """The solution of an iteration that has stopped at ``value`` [n] with these bounds on theta*."""
+    message = ""
+    if problem.is_narrow(bounds, tol, problem.gains(value).policy):
+        status = Status.CONVERGED
+    elif steps >= max_steps:
+        status = Status.STEP_LIMIT
+    elif len(problem.classes[1]) > 1:
+        status, message = Status.REDUCIBLE, explain_classes(problem)
+    else:
+        status = Status.STAGNATED
+    return exact_solution(mdp, problem, value, status, steps, bounds, prior_policy, message, k)
 
 
 def explain_classes(problem: Problem) -> str:

@@ -27,11 +27,12 @@ from erl_torch.chains import RegenerativeLU, SingularChainError
 from erl_torch.mdp import TabularMDP
 from erl_torch.solution import Solution
 from erl_torch.solvers.problem import Problem
-from erl_torch.solvers.result import Sized, exact_solution, how_it_ended, policy_gap, reducible_solution
+from erl_torch.solvers.result import Sized, ended, policy_gap, reducible_solution
 
 FIRST_HORIZON = 300.0  # steps
 GROWTH = 100.0
 LAST_HORIZON = 1e13
+POLISHING_STEPS = 5
 LOOSE = 0.1  # residual, relative to the reward range, at which the horizon grows
 NEAR = 0.3  # width of the undiscounted bounds, relative to the reward range, at which discounting may end
 
@@ -94,9 +95,7 @@ def solve_problem(
             best = state
     assert state is not None
     assert best is not None
-    bounds = (lower, upper)
-    status, message = how_it_ended(problem, bounds, best.policy, tol, state.step, max_steps)
-    return exact_solution(mdp, problem, best.value, status, state.step, bounds, prior_policy, message)
+    return ended(mdp, problem, best.value, (lower, upper), tol, state.step, max_steps, prior_policy)
 
 
 def certify(
@@ -104,8 +103,8 @@ def certify(
 ) -> Solution:
     """``solution``, learnt by whatever means, with the ``theta_bounds`` of ``mdp`` and its policy's own ``gap``.
 
-    Solves the model, unless ``best`` is its ``solve_soft_bellman`` already: the bounds are those, the gap is their
-    lower end on g* less J(policy), so an upper bound that is as sharp as they are narrow.
+    Solves the model, unless ``best`` is its ``solve_soft_bellman`` already: the bounds are those, the gap is the upper
+    end on g* less the lower end on J(policy) from the start (``certificates.objective``).
     """
     problem = Problem.of(mdp, beta, prior_policy)
     bounds = (best or solve_soft_bellman(mdp, beta, prior_policy)).theta_bounds
@@ -146,6 +145,25 @@ def iterate_soft_bellman(problem: Problem, ref: int, tol: float, max_steps: int)
             state = replace(best, step=steps)
             loose *= 0.1
         horizon *= GROWTH
+
+
+def polish(
+    problem: Problem, value: np.ndarray, bounds: tuple[float, float], tol: float
+) -> tuple[np.ndarray, tuple[float, float]]:
+    """(value [n], bounds on theta*) after Newton steps from a value whose own rounding keeps ``bounds`` apart."""
+    ref = problem.regeneration_state()
+    state = _state(problem, value, 0, np.inf)
+    if ref is None or problem.is_narrow(bounds, tol, state.policy):
+        return value, bounds
+
+    def done(state: BellmanState) -> bool:
+        return problem.is_narrow(state.theta_bounds, tol, state.policy)
+
+    best, (lower, upper) = state, bounds
+    for new in _undiscounted(problem, state, ref, done, POLISHING_STEPS):
+        lower, upper = max(lower, new.theta_bounds[0]), min(upper, new.theta_bounds[1])
+        best = new if new.width < best.width else best
+    return best.value, (lower, upper)
 
 
 def _undiscounted(
