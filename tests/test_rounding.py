@@ -10,7 +10,7 @@ import torch
 from conftest import random_mdp, random_policy
 from mpmath import mp, mpf
 
-from erl_torch import InputError, Status, TabularMDP, certify, solve_biasing, solve_soft_bellman
+from erl_torch import InputError, Status, TabularMDP, certify, iterate_biasing, solve_biasing, solve_soft_bellman
 from erl_torch.certificates import gains, objective, policy_gains
 from erl_torch.chains import RegenerativeLU, SingularChainError, long_run
 from erl_torch.evaluation import Judge
@@ -277,3 +277,67 @@ def test_states_that_are_never_left_do_not_reach_superlu(monkeypatch):
     chain = sp.csr_array(np.array([[0.5, 0.5, 0.0], [0.0, 1.0, 0.0], [0.5, 0.0, 0.5]]))
     with pytest.raises(SingularChainError):
         RegenerativeLU(chain, 0)
+
+
+# -- statuses ---------------------------------------------------------------------------------------------------
+
+
+def corridor(n_states):
+    """Steps of -1, 0 and 1 with probability 1/3 each, whatever the action; reward 1 at the far end."""
+    t = np.zeros((n_states, 2, n_states))
+    for s in range(n_states):
+        for to in (min(s + 1, n_states - 1), max(s - 1, 0), s):
+            t[s, :, to] += 1 / 3
+    reward = np.zeros((n_states, 2))
+    reward[-1] = 1.0
+    reward[:, 1] -= 0.01
+    return TabularMDP(t, reward)
+
+
+@pytest.mark.parametrize("solve", [solve_soft_bellman, solve_biasing])
+@pytest.mark.parametrize("n_states", [30, 200])
+def test_a_long_corridor(solve, n_states):
+    """Actions move nothing, so pi* ~ exp(beta r) and the states are equally likely: theta* in closed form."""
+    found = solve(corridor(n_states), 1.0)
+    theta = -mpf(1) / n_states - mp.log((1 + mp.exp(mpf("-0.01"))) / 2)
+    assert mpf(found.theta_bounds[0]) <= theta + mpf(10) ** -16
+    assert theta - mpf(10) ** -16 <= mpf(found.theta_bounds[1])
+    assert np.isfinite(found.gap)
+    assert torch.isfinite(found.value).all()
+    if found.status is Status.CONVERGED:
+        assert found.theta == pytest.approx(float(theta), abs=1e-9)
+
+
+def test_biasing_says_where_it_has_no_eigenvector():
+    """0 leads to 1 and never comes back: one closed class, so soft policy iteration solves it, and Algorithm 1 not."""
+    mdp = TabularMDP([[[0.5, 0.5]], [[0.0, 1.0]]], [[0.0], [2.0]], [1.0, 0.0])
+    with pytest.raises(InputError, match=r"once in the closed set \[1\].*one class of states"):
+        iterate_biasing(mdp, 1.0)
+    found = solve_biasing(mdp, 1.0)
+    assert found.status is Status.REDUCIBLE
+    assert found.theta is None
+    assert found.theta_bounds[0] <= -2 <= found.theta_bounds[1]
+    assert "Soft policy iteration" in found.message
+    assert solve_soft_bellman(mdp, 1.0).theta == pytest.approx(-2, abs=1e-12)
+
+
+def test_logarithms_where_numbers_do_not_reach():
+    """At beta 1e5 psi spans more than doubles do; its logarithm is finite."""
+    solution = solve_soft_bellman(corridor(30), 1e5)
+    assert solution.status is Status.CONVERGED
+    assert not (solution.u > 0).all()
+    assert torch.isfinite(solution.log_u).all()
+    assert torch.isfinite(solution.log_psi).all()
+    # psi = 1 / sum_a pi0 u, equation (7), in logarithms.
+    total = torch.logsumexp(solution.log_u + np.log(0.5), 1)
+    np.testing.assert_allclose(total + solution.log_psi, (total + solution.log_psi)[0], atol=1e-9 * 1e5)
+
+
+def test_a_policy_that_stays_put_has_a_gap_in_every_chain():
+    """Both states are closed under 'stay': from the start in 0 the policy earns 0 less log 2 for ever."""
+    mdp = TabularMDP([[[1, 0], [0.5, 0.5]], [[0, 1], [0.5, 0.5]]], [[0.0, 0.0], [1.0, 1.0]], [0.75, 0.25])
+    best = solve_soft_bellman(mdp, 1.0)
+    stay = torch.tensor([[1.0, 0.0], [1.0, 0.0]], dtype=torch.float64)
+    gap = certify(replace(best, policy=stay), mdp, 1.0, best=best).gap
+    assert gap == pytest.approx(-best.theta - (0.25 - np.log(2)), abs=1e-9)
+    assert gap >= -best.theta_bounds[1] - (0.25 - np.log(2))
