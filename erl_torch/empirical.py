@@ -74,7 +74,7 @@ class EmpiricalMDP:
         reward = np.take_along_axis(self.reward[states], action, axis=1) + np.log(np.minimum(mass, 1.0)) / beta
         start = self.visits[states].sum(1) / self.visits[states].sum()
         problem = Problem(states, p, reward, weight / mass, start, float(beta))
-        return EmpiricalProblem(problem, used, message, reducible)
+        return EmpiricalProblem(problem, used, message, reducible, np.minimum(mass[:, 0], 1.0))
 
     def _part(self) -> tuple[np.ndarray, np.ndarray, str, bool]:
         """(pairs that take part [S, A], entries of ``transition`` that do [nnz], message, several closed classes)."""
@@ -119,6 +119,7 @@ class EmpiricalProblem:
     used: np.ndarray  # [S, A] bool, pairs that take part
     message: str  # what was left out, and why; "" if nothing was
     reducible: bool  # the stream shows several closed classes; this is the most visited
+    tried: np.ndarray  # the prior's mass on the pairs that take part, [n]
 
 
 @dataclass(frozen=True, eq=False)

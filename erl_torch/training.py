@@ -195,6 +195,7 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
     seconds = time.perf_counter() - began
     result = _result(cfg, solution, last, run.n_experience, clock.seconds, seconds)
     result["data"] = None if estimate is None else str(estimate)
+    result["data_smallest_visits"] = None if estimate is None else estimate.smallest_visits
     result["n_skipped"] = run.n_skipped
     write_json(directory / "result.json", result)
     print(_summary(cfg, first, last, start, result, directory, run.unit))
@@ -392,6 +393,8 @@ def _optimal_tags(
 def _data_tags(estimate: Estimate | None) -> dict[str, float]:
     if estimate is None:
         return {}
+    if estimate.withheld:
+        return {"data/theta": estimate.value}
     low, high = estimate.interval()
     return {"data/theta": estimate.value, "data/theta_lower": low, "data/theta_upper": high}
 
@@ -697,7 +700,9 @@ def _summary(
         gap = "" if result["gap"] is None else f"; objective at most {result['gap']:.2g} below its maximum"
         lines.append(f"{'proven':18}theta* in [{low:.10g}, {high:.10g}]{gap}")
     if result["data"]:
-        lines.append(f"{'the data say':18}{result['data']} (95%)")
+        fewest = result["data_smallest_visits"]
+        rests = "" if fewest is None else f" (95%; {fewest} visits or more of each pair that counts)"
+        lines.append(f"{'the data say':18}{result['data']}{rests}")
     if result["n_experience"]:
         rate = done / max(result["seconds_learning"], 1e-3) / 1e6
         lines.append(f"{'tuples streamed':18}{done:,} (of {result['n_experience']:,}; {rate:.3g} M/s)")
