@@ -278,7 +278,7 @@ def test_columns_are_written_whole_or_not_at_all(tmp_path):
     assert len(open_recording(path, 5, 3)) == 40
     assert [p.name for p in (tmp_path / "deep").iterdir()] == ["t"]
     (path / "notes.txt").write_text("mine")
-    with pytest.raises(InputError, match="must be new, empty, or one of columns"):
+    with pytest.raises(InputError, match="what is there is none"):
         save_columns(SHORT, path)
     assert (path / "notes.txt").exists()
 
