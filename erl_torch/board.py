@@ -6,6 +6,7 @@ import json
 import os
 import re
 import shlex
+import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -17,6 +18,7 @@ from tensorboard.plugins.custom_scalar import layout_pb2
 from tensorboard.plugins.hparams import api_pb2, plugin_data_pb2
 from torch.utils.tensorboard import summary
 
+from erl_torch.checks import InputError
 from erl_torch.event_file import EventFile, Mark
 from erl_torch.files import began_with
 
@@ -176,7 +178,11 @@ class Board:
     def texts(self, cfg: DictConfig) -> None:
         """The resolved configuration and the command behind the run."""
         texts = {"configuration": f"```yaml\n{OmegaConf.to_yaml(cfg, resolve=True)}```"}
-        typed = command(self._directory)
+        try:
+            typed = command(self._directory)
+        except InputError as error:
+            typed = None
+            print(f"warning: the log does without the command behind the run ({error})", file=sys.stderr)
         if typed is not None:
             texts["command"] = f"```\n{typed}\n```"
         for tag, markdown in texts.items():

@@ -32,6 +32,7 @@ from erl_torch.learners import states
 FORMAT = 2  # 1 knew no settings
 KEPT = 2
 RESULTS = ("result.json", "solution.npz", "replicas.npz")
+FILES = ("settings.json", *RESULTS, "bands.png", "sweep.png")  # that a run writes under names of its own
 FREE = ("threads", "checkpoint_every")  # settings that no result depends on
 CLASSES: dict[str, Any] = {one.__name__: one for one in states()}
 
@@ -55,6 +56,9 @@ class Checkpoints:
         self._folder = directory / "checkpoints"
         self._settings = {key: value for key, value in _flat(settings).items() if key.split(".")[0] not in FREE}
         self._last = time.monotonic()
+        for path in (*(directory / name for name in FILES), *self._folder.glob("*.ckpt")):
+            if path.is_dir():
+                raise InputError("hydra.run.dir", directory, f"that of a run: {path} is a directory")
         otherwise = "move it away: the checkpoints, if there are any, know their settings"
         before = read_json(directory / "settings.json", "settings", otherwise)
         self._ours = before is not None
