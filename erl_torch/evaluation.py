@@ -14,7 +14,7 @@ import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 
-from erl_torch import checks, kernels
+from erl_torch import kernels
 from erl_torch.chains import RegenerativeLU, SingularChainError, classes
 from erl_torch.experience import batched, reset
 from erl_torch.mdp import TabularMDP, check_policy
@@ -154,7 +154,6 @@ def evaluate(
     if model is not None and mean_return is not None:
         played = mean_return(table)
     elif known is not None and endless:
-        checks.memory("n_episodes", n_episodes, 8 * n_episodes, "the returns of all episodes")
         returns = np.empty(n_episodes)
         kernels.simulate_returns(*sampling_tables(known), policy_cdf(table), horizon, rng, returns)
         played = float(returns.mean())

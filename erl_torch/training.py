@@ -673,6 +673,7 @@ def _check_evaluation(cfg: DictConfig) -> None:
     with _group("evaluation"):
         for key in ("every", "n_episodes", "horizon", "exact_up_to"):
             checks.at_least(key, cfg[key], 1)
+        checks.memory("n_episodes", cfg.n_episodes, 8 * cfg.n_episodes, "the returns of all episodes")
 
 
 # -- what is shown ----------------------------------------------------------------------------------
