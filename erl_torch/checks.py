@@ -53,8 +53,8 @@ def step_size(key: str, value: float) -> None:
 
 def at_least(key: str, value: int, least: int) -> None:
     """Raise InputError unless ``value`` is a whole number in [``least``, 2**63)."""
-    number = not isinstance(value, (bool, str)) and hasattr(value, "__int__")
-    if not (number and math.isfinite(value) and int(value) == value and value >= least):
+    finite = isinstance(value, int) or (hasattr(value, "__float__") and math.isfinite(value))
+    if isinstance(value, bool) or not (finite and int(value) == value and value >= least):
         raise InputError(key, _shown(value), f"a whole number >= {least}")
     if value > MOST:
         raise InputError(key, _shown(value), "below 2**63")

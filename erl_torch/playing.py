@@ -56,9 +56,7 @@ def play(cfg: DictConfig) -> Played:
     module, colon, _ = str(settings.env.id).partition(":")
     if cfg.module != (module if colon else None):
         if colon:
-            raise InputError(
-                "module", cfg.module, f"{module}, which is imported: the environment of {run} is made by it"
-            )
+            raise InputError("module", cfg.module, f"{module}, which makes the run's environment and is imported")
         raise InputError("module", cfg.module, f"left out: the environment of {run} is of none")
     table = run_policy(run, cfg.replica)
     mode = MODES.get(cfg.render)
