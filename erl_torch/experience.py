@@ -89,7 +89,7 @@ def collect(
 
 def _holding(chunks: Iterator[Transitions], n_episodes: int, episode_length: int) -> Iterator[Transitions]:
     """``chunks`` of a stream whose length shows as it goes. Raises InputError before it is too long to be joined."""
-    held, looked_at = 0, 1_000_000
+    held, looked_at = 0, 20_000
     for chunk in chunks:
         held += len(chunk)
         if held >= looked_at:
