@@ -128,7 +128,8 @@ def out_of_memory(error: BaseException | None) -> bool:
     """Whether ``error`` says that memory could not be had; torch has no class of its own for it."""
     said = str(error).lower()
     return isinstance(error, MemoryError) or (
-        isinstance(error, RuntimeError) and ("can't allocate memory" in said or "out of memory" in said)
+        isinstance(error, RuntimeError)
+        and any(words in said for words in ("can't allocate memory", "out of memory", "not enough memory"))
     )
 
 

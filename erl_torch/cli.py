@@ -129,6 +129,7 @@ def _save_config(cfg: DictConfig, filename: str, output_dir: Path) -> None:
     if path.exists():
         _held[path] = text
     else:
+        _held.pop(path, None)
         write_bytes(path, text.encode())
 
 

@@ -330,7 +330,15 @@ class _Learning:
 
     def optimum(self, judge: TabularMDP | None, prior: np.ndarray) -> Solution | None:
         """The exact answer to ``judge``, to compare with."""
-        return None if judge is None else solve_soft_bellman(judge, self.learner.beta, prior)
+        if judge is None:
+            return None
+        try:
+            return solve_soft_bellman(judge, self.learner.beta, prior)
+        except (MemoryError, RuntimeError) as error:  # what factorisations need shows as they go
+            if not checks.out_of_memory(error):
+                raise
+            allowed = f"false: the exact solution of this model needs more memory than there is ({error})"
+            raise InputError("evaluation.certify", "true", allowed) from error
 
     def uncertainty(self, prior: np.ndarray) -> Estimate | None:
         """theta* with its error, as the counts of the stream alone have it; None where that is no small problem."""

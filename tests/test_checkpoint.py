@@ -326,6 +326,18 @@ def test_an_error_after_the_learning_keeps_it(tmp_path, monkeypatch):
     assert Solution.load(tmp_path / "solution.npz").status is Status.COMPLETED
 
 
+def test_a_certificate_beyond_memory_is_named(tmp_path, monkeypatch):
+    def failing(*_):
+        raise MemoryError("SuperLU: not enough memory")
+
+    monkeypatch.setattr("erl_torch.training.solve_soft_bellman", failing)
+    with pytest.raises(
+        InputError, match=r"^evaluation.certify=true: must be false: .* needs more memory than there is"
+    ):
+        train(composed(*SMALL, *SHORT["s1"]), tmp_path)
+    assert not any(tmp_path.iterdir())
+
+
 def test_another_stream_is_refused(tmp_path):
     mdp = random_mdp(np.random.default_rng(0), 4, 2)
     mdp.save(tmp_path / "mdp.npz")
