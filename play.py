@@ -23,7 +23,9 @@ def main(cfg: DictConfig) -> None:
 
     try:
         play(cfg)
-    except cli.BY_RUN + cli.BY_CONFIGURATION as error:  # Hydra would add a line of its own
+    except Exception as error:  # Hydra would add a line of its own
+        if not cli.expected(error):
+            raise
         raise SystemExit(cli._report(error)) from None
 
 

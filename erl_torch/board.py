@@ -6,6 +6,7 @@ import json
 import os
 import re
 import shlex
+import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -17,7 +18,9 @@ from tensorboard.plugins.custom_scalar import layout_pb2
 from tensorboard.plugins.hparams import api_pb2, plugin_data_pb2
 from torch.utils.tensorboard import summary
 
-from erl_torch.event_file import EventFile
+from erl_torch.checks import InputError
+from erl_torch.event_file import EventFile, Mark
+from erl_torch.files import began_with
 
 Band = tuple[str, str, str]  # tags of value, lower and upper end
 Chart = Sequence[str | Band]  # lines (patterns of tags), or bands
@@ -118,11 +121,12 @@ def hyperparameters(cfg: DictConfig, **more: Any) -> dict[str, int | float | str
 
 
 def command(directory: Path) -> str | None:
-    """What was typed to make the run in ``directory``; None where that was not the command line."""
-    path = directory / ".hydra" / "overrides.yaml"
-    if not path.exists():
-        return None
-    return shlex.join(["python", "train.py", *map(str, OmegaConf.load(path))])
+    """What was typed to make the run in ``directory``; None where that was not the command line.
+
+    Raises InputError for a damaged note of it.
+    """
+    typed = began_with(directory)
+    return None if typed is None else shlex.join(["python", "train.py", *typed])
 
 
 class Board:
@@ -132,7 +136,7 @@ class Board:
         directory: the run's.
         hyperparameters: as ``hyperparameters`` gives them.
         boards: charts of tab Custom Scalars.
-        size: of the event file at the checkpoint that the run goes on from; 0 begins it.
+        mark: of the event file at the checkpoint that the run goes on from; None begins it.
     """
 
     def __init__(
@@ -140,15 +144,15 @@ class Board:
         directory: str | os.PathLike[str],
         hyperparameters: Mapping[str, int | float | str],
         boards: Boards,
-        size: int = 0,
+        mark: Mark | None = None,
     ) -> None:
-        self._file = EventFile(directory, size)
+        self._file = EventFile(directory, mark)
         self._directory = Path(directory)
         self._lines: dict[str, float] = {}
         # Session start and end go into the run's own file: add_hparams would open a run directory more.
         # No experiment summary: TensorBoard takes the first it finds and hides other runs' columns.
         _, session_start, self._session_end = summary.hparams(dict(hyperparameters), {})  # type: ignore[no-untyped-call]
-        if not size:
+        if self._file.fresh:
             shown = summary.custom_scalars({})  # type: ignore[no-untyped-call]
             shown.value[0].tensor.string_val[0] = _layout(boards).SerializeToString()
             self._file.add(shown)
@@ -174,14 +178,22 @@ class Board:
     def texts(self, cfg: DictConfig) -> None:
         """The resolved configuration and the command behind the run."""
         texts = {"configuration": f"```yaml\n{OmegaConf.to_yaml(cfg, resolve=True)}```"}
-        typed = command(self._directory)
+        try:
+            typed = command(self._directory)
+        except InputError as error:
+            typed = None
+            print(f"warning: the log does without the command behind the run ({error})", file=sys.stderr)
         if typed is not None:
             texts["command"] = f"```\n{typed}\n```"
         for tag, markdown in texts.items():
             self._file.add(summary.text(tag, markdown))  # type: ignore[no-untyped-call]
 
-    def flush(self) -> int:
-        """Hand all records to the system; the size of the event file."""
+    def mark(self) -> Mark:
+        """Where the event file can be gone on with, once it is flushed."""
+        return self._file.mark()
+
+    def flush(self) -> Mark:
+        """Hand all records to the system; the mark."""
         return self._file.flush()
 
     def __enter__(self) -> Board:

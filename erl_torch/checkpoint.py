@@ -1,9 +1,9 @@
 """Checkpoints of a run: everything that is needed to go on, bit for bit, in files that no crash can spoil.
 
 A run directory has ``settings.json`` from the start, and ``checkpoints/`` until the run is complete. A checkpoint is a
-line with its SHA-256, then what ``torch.save`` makes of numbers, tensors and containers, read back with
-``weights_only``. It is written under a temporary name and renamed; the last two are kept, and one that is damaged
-is passed over.
+line with its SHA-256, then what ``torch.save`` makes of numbers, tensors and containers, the settings of the run among
+them, read back with ``weights_only``. It is written under a temporary name and renamed; the last two are kept, and one
+that is damaged is passed over.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import io
-import json
 import math
+import pickle
 import shutil
 import sys
 import time
@@ -24,13 +24,15 @@ from typing import Any
 import numpy as np
 import torch
 
-from erl_torch.checks import InputError
+from erl_torch.checks import InputError, out_of_memory
 from erl_torch.event_file import PATTERN
-from erl_torch.files import write_bytes, write_json
+from erl_torch.files import read_json, write_bytes, write_json
 from erl_torch.learners import states
 
-FORMAT = 1
+FORMAT = 2  # 1 knew no settings
 KEPT = 2
+RESULTS = ("result.json", "solution.npz", "replicas.npz")
+FILES = ("settings.json", *RESULTS, "bands.png", "sweep.png")  # that a run writes under names of its own
 FREE = ("threads", "checkpoint_every")  # settings that no result depends on
 CLASSES: dict[str, Any] = {one.__name__: one for one in states()}
 
@@ -45,7 +47,8 @@ class Checkpoints:
         device: where the tables of a checkpoint go.
 
     Raises:
-        InputError: the directory holds a run of other settings; the first keys that differ are named.
+        InputError: the directory holds a run of other settings; the first keys that differ are named. Or its
+            ``settings.json`` is damaged.
     """
 
     def __init__(self, directory: Path, settings: Mapping[str, Any], every: float | None, device: str = "cpu") -> None:
@@ -53,24 +56,53 @@ class Checkpoints:
         self._folder = directory / "checkpoints"
         self._settings = {key: value for key, value in _flat(settings).items() if key.split(".")[0] not in FREE}
         self._last = time.monotonic()
-        self._check(directory / "settings.json")
+        for path in (*(directory / name for name in FILES), *self._folder.glob("*.ckpt")):
+            if path.is_dir():
+                raise InputError("hydra.run.dir", directory, f"that of a run: {path} is a directory")
+        otherwise = "move it away: the checkpoints, if there are any, know their settings"
+        before = read_json(directory / "settings.json", "settings", otherwise)
+        self._ours = before is not None
+        self._others: set[Path] = set()  # event files that are not this run's
+        if before is not None:
+            self._compare(before)
 
     def start(self) -> dict[str, Any] | None:
-        """Take possession of the directory (leftovers of a killed run go), and ``read``; None: the run begins."""
+        """Take possession of the directory (leftovers of a killed run go), and ``read``; None: the run begins.
+
+        Raises InputError as ``read``; the directory is then as it was.
+        """
+        found = self.read()
         write_json(self.directory / "settings.json", self._settings)
         for leftover in (*self.directory.glob(".*.tmp"), *self._folder.glob(".*.tmp")):
             leftover.unlink(missing_ok=True)
-        return self.read()
+        if self._ours and found is None:  # it repeats every record
+            for path in self.directory.glob(PATTERN):
+                path.unlink(missing_ok=True)
+        self._others = set(self.directory.glob(PATTERN))
+        return found
 
     def read(self) -> dict[str, Any] | None:
-        """The newest checkpoint that can be read; those that cannot go, with a warning."""
+        """The newest checkpoint that can be read; damaged ones go, with a warning.
+
+        Raises InputError for one of other settings, or one that is whole but of another version of the program.
+        """
         for path in sorted(self._folder.glob("*.ckpt"), reverse=True):
             try:
-                found = _read(path, self.device)
+                body = _body(path)
             except (OSError, ValueError) as error:
                 print(f"warning: {path} cannot be read ({error}): going on from the one before", file=sys.stderr)
-                path.unlink(missing_ok=True)
+                if isinstance(error, ValueError):
+                    path.unlink(missing_ok=True)
                 continue
+            try:
+                settings, content = _loaded(body)
+                self._compare(settings)
+                found: dict[str, Any] = decode(content, self.device)
+            except (AttributeError, KeyError, TypeError, ValueError, RuntimeError, pickle.UnpicklingError) as error:
+                if isinstance(error, InputError) or out_of_memory(error):
+                    raise
+                said = f"of this version ({' '.join(str(error).split())[:200]}), or moved away"
+                raise InputError("checkpoint", path, said) from error
             return found
         return None
 
@@ -81,24 +113,31 @@ class Checkpoints:
             yield
         except InputError:
             if not learnt():
-                for path in (self.directory / "settings.json", *self.directory.glob(PATTERN)):
+                for path in {self.directory / "settings.json", *self.directory.glob(PATTERN)} - self._others:
                     path.unlink(missing_ok=True)
                 self.clear()
             raise
 
     def result(self) -> dict[str, Any] | None:
-        """What the run came to, if it is complete."""
-        try:
-            found: dict[str, Any] = json.loads((self.directory / "result.json").read_text())
-        except (OSError, ValueError):
-            return None
-        return None if found.get("status") == "stopped" else found
+        """What the run came to, if it is complete.
+
+        Raises InputError for a damaged file, and where there are files of a run whose settings nothing tells.
+        """
+        there = [name for name in RESULTS if (self.directory / name).exists()]
+        if there and not self._ours and not any(self._folder.glob("*.ckpt")):
+            allowed = f"a new one, or that of a run: it holds a {there[0]} without the settings.json behind it"
+            raise InputError("hydra.run.dir", self.directory, allowed)
+        otherwise = "move it away, and the run goes on from its checkpoint or begins again"
+        found = read_json(self.directory / "result.json", "result", otherwise)
+        if found is not None and not {"status", "objective", "seconds"} <= found.keys():
+            raise InputError("result", self.directory / "result.json", f"what a run writes; {otherwise}")
+        return None if found is None or found["status"] == "stopped" else found
 
     def offer(self, step: int, content: Callable[[], dict[str, Any]], now: bool = False) -> None:
         """Write ``content()`` as the checkpoint of ``step``, if it is time (or at once, ``now``)."""
         if not now and (self.every is None or time.monotonic() - self._last < self.every):
             return
-        _write(self._folder / f"{step:018d}.ckpt", content())
+        _write(self._folder / f"{step:018d}.ckpt", self._settings, content())
         for path in sorted(self._folder.glob("*.ckpt"))[:-KEPT]:
             path.unlink(missing_ok=True)
         self._last = time.monotonic()
@@ -107,13 +146,7 @@ class Checkpoints:
         """The run is complete: none is needed any more."""
         shutil.rmtree(self._folder, ignore_errors=True)
 
-    def _check(self, path: Path) -> None:
-        if not path.exists():
-            return
-        try:
-            before = json.loads(path.read_text())
-        except ValueError as error:
-            raise InputError("settings", path, f"readable JSON ({error}); move it away to begin anew") from error
+    def _compare(self, before: Mapping[str, Any]) -> None:
         differ = sorted(key for key in {**before, **self._settings} if before.get(key) != self._settings.get(key))
         if differ:
             shown = ", ".join(f"{key}={self._settings.get(key)} (there: {before.get(key)})" for key in differ[:5])
@@ -179,26 +212,27 @@ def decode(value: Any, device: str = "cpu") -> Any:
     return CLASSES[kind](**{name: decode(item, device) for name, item in value.items() if name != "class"})
 
 
-def _write(path: Path, content: Any) -> None:
+def _write(path: Path, settings: Mapping[str, Any], content: Any) -> None:
     buffer = io.BytesIO()
-    torch.save({"format": FORMAT, "content": encode(content)}, buffer)
+    torch.save({"format": FORMAT, "settings": dict(settings), "content": encode(content)}, buffer)
     body = buffer.getvalue()
     write_bytes(path, hashlib.sha256(body).hexdigest().encode() + b"\n" + body)
 
 
-def _read(path: Path, device: str) -> dict[str, Any]:
-    """Raises ValueError or OSError where the file is not what was written."""
+def _body(path: Path) -> bytes:
+    """Raises ValueError where the file is not what was written."""
     line, _, body = path.read_bytes().partition(b"\n")
     if hashlib.sha256(body).hexdigest().encode() != line:
         raise ValueError("its checksum does not match")
-    try:
-        whole = torch.load(io.BytesIO(body), weights_only=True)
-        if whole["format"] != FORMAT:
-            raise ValueError(f"it is of format {whole['format']}, not {FORMAT}")
-        found: dict[str, Any] = decode(whole["content"], device)
-    except (KeyError, TypeError, RuntimeError) as error:
-        raise ValueError(str(error).splitlines()[0]) from error
-    return found
+    return body
+
+
+def _loaded(body: bytes) -> tuple[dict[str, Any], Any]:
+    """Settings and encoded content."""
+    whole = torch.load(io.BytesIO(body), weights_only=True)
+    if whole["format"] != FORMAT:
+        raise ValueError(f"it is of format {whole['format']}, not {FORMAT}")
+    return whole["settings"], whole["content"]
 
 
 def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -206,7 +240,15 @@ def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     for key, value in settings.items():
         if isinstance(value, Mapping) and value:
             found |= _flat(value, f"{prefix}{key}.")
-        else:  # JSON has no infinities
-            finite = not isinstance(value, float) or math.isfinite(value)
-            found[f"{prefix}{key}"] = value if finite else str(value)
+        else:
+            found[f"{prefix}{key}"] = _json(value)
     return found
+
+
+def _json(value: Any) -> Any:
+    """``value`` as JSON gives it back; it has no infinities."""
+    if isinstance(value, Mapping):
+        return {str(key): _json(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_json(item) for item in value]
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value

@@ -13,11 +13,13 @@ import sys
 import threading
 import traceback
 from collections.abc import Callable
+from concurrent.futures import BrokenExecutor
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
 from hydra import compose, initialize_config_dir
+from hydra.core import utils as hydra_utils
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, OverrideParseException
 from hydra.types import RunMode
@@ -25,14 +27,15 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from erl_torch import sweeps
-from erl_torch.checks import InputError
+from erl_torch.checks import InputError, out_of_memory
 from erl_torch.config import register
-from erl_torch.files import alone
+from erl_torch.files import alone, began_with, write_bytes
+from erl_torch.output import lasting
 
 # Here, for jobs in processes of their own: loading the task imports this module, and names directories next.
 register()
 
-BY_RUN = (InputError, ArithmeticError, OSError)
+BY_RUN = (InputError, ArithmeticError, OSError, MemoryError, BrokenExecutor)
 BY_CONFIGURATION = (HydraException, OmegaConfBaseException)
 OPEN_NODES = (
     "env.kwargs.",
@@ -78,7 +81,8 @@ class Signals:
         self.received = number
         if number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, signal.SIG_DFL)
-        print("\nstopping at the next safe point; what is done will be saved", file=sys.stderr)
+        with contextlib.suppress(OSError):  # past sys.stderr, which may be in the midst of a word
+            os.write(2, b"\nstopping at the next safe point; what is done will be saved\n")
 
 
 def job(work: Callable[[DictConfig, Path, Callable[[], None]], Any]) -> Callable[[DictConfig], Any]:
@@ -92,6 +96,7 @@ def job(work: Callable[[DictConfig, Path, Callable[[], None]], Any]) -> Callable
 
     @functools.wraps(work)
     def task(cfg: DictConfig) -> Any:
+        lasting()  # in a launcher's process too
         hydra = HydraConfig.get()
         directory = Path(hydra.runtime.output_dir)
         # A directory without a configuration is many runs'.
@@ -100,19 +105,48 @@ def job(work: Callable[[DictConfig, Path, Callable[[], None]], Any]) -> Callable
             return _one_of_many(attempt, hydra, directory)
         try:
             return attempt()
-        except BY_RUN as error:
+        except Exception as error:
+            if not expected(error):
+                raise
             raise SystemExit(_report(error)) from error
 
     return task
 
 
+def expected(error: BaseException) -> bool:
+    """Whether one line says all: no bug of this program."""
+    return isinstance(error, BY_RUN + BY_CONFIGURATION) or out_of_memory(error)
+
+
+_held: dict[Path, str] = {}  # what Hydra had to write where a run has its own
+
+
+def _save_config(cfg: DictConfig, filename: str, output_dir: Path) -> None:
+    """Hydra's, which writes ``.hydra/`` before the work has had a look at the directory: a command that is refused
+    there would put its settings in the place of the run's."""
+    path = Path(str(output_dir)) / filename
+    text = OmegaConf.to_yaml(cfg)
+    if path.exists():
+        _held[path] = text
+    else:
+        _held.pop(path, None)
+        write_bytes(path, text.encode())
+
+
+hydra_utils._save_config = _save_config
+
+
 def _attempt(work: Callable[..., Any], cfg: DictConfig, directory: Path, shared: bool) -> Any:
+    held = [path for path in _held if directory in path.parents]
     with contextlib.nullcontext() if shared else alone(directory):
         try:
             with Signals() as signals:
-                return work(cfg, directory, signals.safe_point)
+                value = work(cfg, directory, signals.safe_point)
+            for path in held:
+                write_bytes(path, _held[path].encode())
+            return value
         except BY_RUN:
-            if {entry.name for entry in directory.iterdir()} <= {".hydra"}:
+            if not held and {entry.name for entry in directory.iterdir()} <= {".hydra"}:
                 shutil.rmtree(directory)
                 with contextlib.suppress(OSError):  # not empty: other runs
                     directory.parent.rmdir()
@@ -132,9 +166,9 @@ def _one_of_many(attempt: Callable[[], Any], hydra: Any, directory: Path) -> Any
             raise  # the signal was meant for the whole sweep
         return None
     except Exception as error:
-        if not isinstance(error, BY_RUN):
+        if not expected(error):
             traceback.print_exc()
-        complaint = _line(error) if isinstance(error, BY_RUN) else f"{type(error).__name__}: {error}"
+        complaint = _line(error) if expected(error) else f"{type(error).__name__}: {error}"
         sweeps.fail(sweep, number, complaint)
         return None
     sweeps.note(sweep, number, "ended", value=value if isinstance(value, float) and math.isfinite(value) else None)
@@ -152,8 +186,10 @@ def run(main: Callable[[], Any], about: str, conf: Path, config_name: str) -> No
 
     With HYDRA_FULL_ERROR=1 in the environment every traceback is shown.
     """
+    lasting()
+    typed = sys.argv[1:]
     try:
-        arguments = _resumed(sys.argv[1:])
+        arguments = _resumed(typed)
     except InputError as error:
         raise SystemExit(_report(error)) from None
     # Keys that no schema lists need Hydra's "++"; the user need not know.
@@ -166,6 +202,10 @@ def run(main: Callable[[], Any], about: str, conf: Path, config_name: str) -> No
     rows: list[dict[str, Any]] = []
     try:
         sweeps.presets()
+        for argument in typed:
+            if argument.startswith("resume="):
+                directory = Path(argument.removeprefix("resume="))
+                _same_modules(directory, arguments, [a for a in typed if a != argument], conf, config_name)
         if {"-h", "--help"} & set(arguments):
             print(_help(about, conf, config_name, [a for a in arguments if not a.startswith("-")]))
             return
@@ -179,7 +219,7 @@ def run(main: Callable[[], Any], about: str, conf: Path, config_name: str) -> No
     except Exception as error:
         if rows and len(sweeps.failures(rows)) == len(rows):
             raise SystemExit(1) from None  # a sweeper has nothing to choose from, and says so in its own way
-        if full or not isinstance(error, BY_CONFIGURATION + BY_RUN):
+        if full or not expected(error):
             raise
         raise SystemExit(_report(error)) from None
     if sweeps.failures(rows):
@@ -192,12 +232,26 @@ def _resumed(arguments: list[str]) -> list[str]:
     if not given:
         return arguments
     directory = Path(given[-1].removeprefix("resume="))
-    try:
-        began: Any = OmegaConf.to_container(OmegaConf.load(directory / ".hydra" / "overrides.yaml"))
-    except OSError as error:
-        raise InputError("resume", directory, f"a run directory ({error.strerror}: {error.filename})") from error
+    began = began_with(directory, "resume")
+    if began is None:
+        raise InputError("resume", directory, "a run directory: one with .hydra/overrides.yaml")
+    for argument in began:  # as Hydra notes them: none of its own settings and options
+        if not re.fullmatch(r"(\+\+|\+|~)?(?!hydra\b)\w[\w@/.:-]*(=.*)?", argument, re.DOTALL):
+            raise InputError("resume", directory, f"that of a run: {argument!r} in its overrides.yaml is no key=value")
     others = [a for a in arguments if a not in given]
     return [*began, *others, "hydra.run.dir='{}'".format(str(directory).replace("'", "\\'"))]
+
+
+def _same_modules(directory: Path, arguments: list[str], typed: list[str], conf: Path, config_name: str) -> None:
+    """Raise InputError if the environment of a run directory is of a module that nobody has ``typed``: making it
+    would run that module."""
+    with initialize_config_dir(str(conf.resolve()), version_base="1.3"):
+        cfg = compose(config_name, [a for a in arguments if not a.startswith(("hydra", "-"))])
+    named = str(cfg.env.get("id"))
+    module = named.partition(":")[0]
+    if ":" in named and not any(f"{module}:" in a.partition("=")[2] for a in typed if a.lstrip("+").startswith("env")):
+        allowed = f"named with its module, which is imported: add env={named}"
+        raise InputError("resume", directory, allowed)
 
 
 def _by_id(argument: str, conf: Path) -> list[str]:
@@ -242,7 +296,11 @@ def _line(error: Exception) -> str:
         return _explain(error)
     if isinstance(error, OSError):
         return f"{error.filename or 'file system'}: {error.strerror or error}"
-    return str(error)
+    if out_of_memory(error):
+        return f"memory: not enough ({str(error).splitlines()[0] if str(error) else 'the system gives no more'})"
+    if isinstance(error, BrokenExecutor):
+        return f"processes: one was killed, for want of memory perhaps ({error})"
+    return " ".join(str(error).split())
 
 
 def _explain(error: Exception) -> str:

@@ -25,6 +25,8 @@ from erl_torch.learners import LEARNERS
 from erl_torch.mdp import TabularMDP
 from erl_torch.training import make_env, make_learner, make_world
 
+FIT_BYTES = 500  # of the figures of one fit
+
 
 def run_comparison(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lambda: None) -> dict[str, Any]:
     """Run ``cfg`` (as composed from ``conf/compare.yaml``) in ``directory``; returns what ``compare.json`` holds.
@@ -33,8 +35,14 @@ def run_comparison(cfg: DictConfig, directory: Path, safe_point: Callable[[], No
     """
     began = time.perf_counter()
     check_comparison_keys(cfg)
-    for key, least in (("seed", 0), ("seeds", 1), ("n_sizes", 1), ("processes", 1)):
+    for key, least in (("seed", 0), ("seeds", 1), ("n_sizes", 1)):
         checks.at_least(key, cfg[key], least)
+    checks.at_least("seed + seeds", cfg.seed + cfg.seeds, 1)
+    checks.workers("processes", cfg.processes)
+    fits = len(cfg.learners) * cfg.seeds
+    checks.memory("seeds", cfg.seeds, FIT_BYTES * fits, f"{fits:,} fits")
+    checks.memory("n_sizes", cfg.n_sizes, FIT_BYTES * fits * cfg.n_sizes, f"{fits:,} fits of each size")
+    checks.processes("processes", min(cfg.processes, fits))
     if cfg.experience.name != "simulate":
         raise InputError("experience", cfg.experience.name, "simulate: every seed needs a stream of its own")
     if cfg.experience.save_to is not None:

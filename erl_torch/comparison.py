@@ -148,9 +148,9 @@ def compare(
         "n_episodes": n_episodes,
         "episode_length": episode_length,
         "n_sizes": n_sizes,
-        "processes": processes,
     }.items():
         checks.at_least(key, value, 1)
+    checks.workers("processes", processes)
     prior = check_policy("prior_policy", prior_policy, mdp.n_states, mdp.n_actions)
     beta = learners[names[0]].beta
     for name, learner in learners.items():

@@ -317,6 +317,7 @@ class Play:
     n_episodes: int = 20
     seed: int = 0
     greedy: bool = False
+    module: str | None = None
     replica: int | None = None
     render: str = "ansi"
     n_steps: int | None = None

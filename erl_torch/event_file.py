@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import os
 import socket
+import struct
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -16,6 +18,9 @@ from tensorboard.compat.proto.event_pb2 import Event
 from tensorboard.summary.writer.record_writer import RecordWriter
 
 PATTERN = "events.out.tfevents.*"
+HEAD, TAIL = 12, 4  # bytes about a record: its length with a checksum, and the checksum of its content
+
+Mark = tuple[str, int]  # of a file at some moment: its name and its size in bytes
 
 
 class EventFile:
@@ -23,37 +28,64 @@ class EventFile:
 
     Args:
         directory: made if it is missing.
-        size: bytes to keep of the file that is there; 0 begins anew.
+        mark: as ``mark`` gave it, to go on from there; None begins a file beside those that are there. Of a file that
+            has become shorter the whole records are kept, and one that is gone is begun, with a warning.
+
+    ``fresh`` is whether the file has been begun.
     """
 
-    def __init__(self, directory: str | os.PathLike[str], size: int = 0) -> None:
+    def __init__(self, directory: str | os.PathLike[str], mark: Mark | None = None) -> None:
         directory = Path(directory)
         directory.mkdir(parents=True, exist_ok=True)
-        before = sorted(directory.glob(PATTERN))
-        if size and before and before[0].stat().st_size >= size:
-            path = before[0]
-            os.truncate(path, size)
-        else:
-            size = 0
-            for path in before:
-                path.unlink()
-            path = directory / f"events.out.tfevents.{int(time.time())}.{socket.gethostname()}.{os.getpid()}"
+        name, size = mark or (f"events.out.tfevents.{int(time.time())}.{socket.gethostname()}.{os.getpid()}", 0)
+        path = directory / name
+        kept = size
+        if mark is not None:
+            there = path.stat().st_size if path.is_file() else 0
+            kept = size if there >= size else _whole_records(path)
+            if kept < size:
+                print(
+                    f"warning: {path} has lost what it held at the checkpoint: records of before are missing",
+                    file=sys.stderr,
+                )
+            if there:
+                os.truncate(path, kept)
+        self.name, self.fresh = name, not kept
         self._file = open(path, "ab")  # noqa: SIM115 (closed by close)
         self._records = RecordWriter(self._file)
-        if not size:
+        if self.fresh:
             self._write(Event(wall_time=time.time(), file_version="brain.Event:2"))
 
     def add(self, summary: Any, step: int = 0) -> None:
         """One record of a summary, as ``torch.utils.tensorboard.summary`` makes them."""
         self._write(Event(wall_time=time.time(), step=step, summary=summary))
 
-    def flush(self) -> int:
-        """Hand everything to the system; the size of the file."""
+    def mark(self) -> Mark:
+        """Where the file can be gone on with, once it is flushed."""
+        return self.name, self._file.tell()
+
+    def flush(self) -> Mark:
+        """Hand everything to the system; the mark."""
         self._records.flush()
-        return self._file.tell()
+        return self.mark()
 
     def close(self) -> None:
         self._records.close()
 
     def _write(self, event: Event) -> None:
         self._records.write(event.SerializeToString())
+
+
+def _whole_records(path: Path) -> int:
+    """Bytes of the records at the front of ``path`` that are there to their ends; 0 without the file."""
+    kept = 0
+    if path.is_file():
+        size = path.stat().st_size
+        with open(path, "rb") as file:
+            while len(head := file.read(HEAD)) == HEAD:
+                end = kept + HEAD + struct.unpack_from("<Q", head)[0] + TAIL
+                if end > size:
+                    break
+                kept = end
+                file.seek(kept)
+    return kept

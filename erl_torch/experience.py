@@ -35,6 +35,8 @@ from erl_torch.sampling import Sampler
 from erl_torch.transitions import Transitions, join
 
 BLOCK = 1_000_000  # steps a compiled call, so that signals and progress bars are served
+TUPLE_BYTES = 32  # of a tuple while it is sampled: two pairs and five columns
+COLUMN_BYTES = 24  # of a tuple in a file, or in memory
 
 Report = Callable[[int], object]
 
@@ -71,6 +73,8 @@ def collect(
     rng = seed if isinstance(seed, Streams) else streams(seed)
     report = report or (lambda _: None)
     mdp = known_mdp(source)
+    if mdp is not None or isinstance(source, gym.vector.VectorEnv):  # exactly so many tuples
+        _fits("memory", n_episodes, episode_length, TUPLE_BYTES * n_episodes * episode_length)
     if mdp is not None:
         return _simulate(mdp, n_episodes, episode_length, rng, behaviour, prior, on_prior, report)
     batch = None if isinstance(source, (TabularMDP, gym.vector.VectorEnv)) else batched(source)
@@ -79,7 +83,28 @@ def collect(
             n_episodes, episode_length, seed=rng, behaviour_policy=None if on_prior else behaviour, prior_policy=prior
         )
     assert not isinstance(source, TabularMDP)
-    return join(list(_played(source, n_episodes, episode_length, rng, behaviour, prior, on_prior, report)))
+    played = _played(source, n_episodes, episode_length, rng, behaviour, prior, on_prior, report)
+    return join(list(_holding(played, n_episodes, episode_length)))
+
+
+def _holding(chunks: Iterator[Transitions], n_episodes: int, episode_length: int) -> Iterator[Transitions]:
+    """``chunks`` of a stream whose length shows as it goes. Raises InputError before it is too long to be joined."""
+    held, looked_at = 0, 20_000
+    for chunk in chunks:
+        held += len(chunk)
+        if held >= looked_at:
+            _fits("memory", n_episodes, episode_length, COLUMN_BYTES * held)  # as much again
+            looked_at = held + held // 8
+        yield chunk
+
+
+def _fits(where: str, n_episodes: int, episode_length: int, needed: int) -> None:
+    """Raise InputError unless ``needed`` bytes of a stream fit; ``where``: memory, or the directory it goes to."""
+    what = f"a stream of {n_episodes:,} episodes of {episode_length:,} steps"
+    if where == "memory":
+        checks.memory("n_episodes", n_episodes, needed, what)
+    else:
+        checks.disk("n_episodes", n_episodes, needed, what, where)
 
 
 def _played(
@@ -128,6 +153,8 @@ def record(
     behaviour = prior if on_prior else check_policy("behaviour_policy", behaviour_policy, n_states, n_actions)
     rng = seed if isinstance(seed, Streams) else streams(seed)
     chunks: Iterator[Transitions]
+    if mdp is not None or isinstance(source, gym.vector.VectorEnv):
+        _fits(str(directory), n_episodes, episode_length, COLUMN_BYTES * n_episodes * episode_length)
     if mdp is not None:
         reward = mdp.reward
         blocks = _blocks(mdp, n_episodes * episode_length, episode_length, rng, behaviour, prior, on_prior)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import json
 import os
@@ -12,12 +13,15 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+from omegaconf import OmegaConf
 
 from erl_torch.checks import InputError
 
 
 def _write(path: str | os.PathLike[str], fill: Callable[[BinaryIO], None]) -> Path:
     path = Path(path)
+    if path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
@@ -58,6 +62,40 @@ def write_bytes(path: str | os.PathLike[str], content: bytes) -> Path:
 def write_json(path: str | os.PathLike[str], value: Mapping[str, Any]) -> Path:
     """Write JSON (no NaN or infinity)."""
     return write_bytes(path, (json.dumps(value, indent=2, allow_nan=False) + "\n").encode())
+
+
+def read_json(path: str | os.PathLike[str], key: str, otherwise: str) -> dict[str, Any] | None:
+    """A JSON object; None where there is no such file.
+
+    Raises InputError (under ``key``) for a file that holds anything else; ``otherwise`` says what to do about it.
+    """
+    try:
+        found = json.loads(Path(path).read_bytes())
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(key, path, f"readable JSON ({error}); {otherwise}") from error
+    if not isinstance(found, dict):
+        raise InputError(key, path, f"a JSON object; {otherwise}")
+    return found
+
+
+def began_with(directory: Path, key: str = "overrides") -> list[str] | None:
+    """The arguments that the run in ``directory`` began with; None where they are not noted.
+
+    Raises InputError (under ``key``) for a note that is damaged.
+    """
+    path = directory / ".hydra" / "overrides.yaml"
+    if not path.exists():
+        return None
+    try:
+        found: Any = OmegaConf.to_container(OmegaConf.load(path))
+    except Exception as error:  # of the parser, of OmegaConf, of the file system, of text that is none
+        said = " ".join(str(error).split())[:200]
+        raise InputError(key, path, f"a readable list of the arguments that the run began with ({said})") from error
+    if not isinstance(found, list) or not all(isinstance(item, str) for item in found):
+        raise InputError(key, path, "the list of the arguments that the run began with, key=value each")
+    return found
 
 
 def write_png(path: str | os.PathLike[str], pixels: np.ndarray) -> Path:

@@ -9,9 +9,7 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
-import yaml
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
 from erl_torch import checks
 from erl_torch.checks import InputError
@@ -55,6 +53,11 @@ def play(cfg: DictConfig) -> Played:
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # pygame draws without a display
     run = find_run(cfg.run)
     settings = run_settings(run)
+    module, colon, _ = str(settings.env.id).partition(":")
+    if cfg.module != (module if colon else None):
+        if colon:
+            raise InputError("module", cfg.module, f"{module}, which makes the run's environment and is imported")
+        raise InputError("module", cfg.module, f"left out: the environment of {run} is of none")
     table = run_policy(run, cfg.replica)
     mode = MODES.get(cfg.render)
     with contextlib.closing(make_env(settings.env)) as plain:
@@ -94,12 +97,18 @@ def episodes(
     ``n_shown`` steps of the first episode are rendered, in the environment's render mode.
     """
     cdf = np.cumsum(policy, axis=1)
+    checks.memory("n_episodes", n_episodes, 17 * n_episodes, "the returns and lengths of all episodes")
     returns, lengths, ended = np.zeros(n_episodes), np.zeros(n_episodes, np.int64), np.zeros(n_episodes, bool)
-    shown = []
-    for i, rng in enumerate(streams(seed).evaluation.spawn(n_episodes)):
+    shown: list[Any] = []
+    evaluation = streams(seed).evaluation
+    for i in range(n_episodes):
+        (rng,) = evaluation.spawn(1)
         s = reset(env, rng)
         if i == 0 and n_shown:
             shown.append(env.render())
+            if isinstance(shown[0], np.ndarray):
+                most = min(n_shown, horizon)
+                checks.memory("n_steps", n_shown, shown[0].nbytes * most, f"{most:,} pictures")
         for _ in range(horizon):
             a = int(np.searchsorted(cdf[s], rng.random() * cdf[s, -1], side="right"))
             observation, reward, terminated, truncated, _ = env.step(a)
@@ -140,7 +149,7 @@ def run_settings(run: Path) -> DictConfig:
         if "n_samples" in cfg.env:
             cfg.env.reward = "original"  # not those of the control task's endless model
         checks.at_least("evaluation.horizon", cfg.evaluation.horizon, 1)
-    except (OSError, yaml.YAMLError, OmegaConfBaseException, InputError, AttributeError, KeyError, TypeError) as error:
+    except Exception as error:  # of the parser, of OmegaConf, of values of any kind
         cause = " ".join(str(error).split())[:200]
         raise InputError(
             "run", run, f"a run directory with the configuration {path.relative_to(run)} ({cause})"

@@ -452,7 +452,8 @@ class ColumnWriter:
         with ColumnWriter("tuples") as writer:
             writer.append(chunk)
 
-    A directory of columns that has the name already is replaced. Raises InputError for one that holds anything else.
+    A directory of columns that has the name already is replaced, once the new one is whole. Raises InputError for one
+    that holds anything else, and for a link.
     """
 
     def __init__(self, directory: str | os.PathLike[str]) -> None:
@@ -461,8 +462,7 @@ class ColumnWriter:
         self._n = 0
 
     def __enter__(self) -> ColumnWriter:
-        if self.directory.exists() and not self._replaceable():
-            raise InputError("directory", self.directory, "new, empty, or one of columns")
+        check_target("directory", self.directory)
         shutil.rmtree(self._temporary, ignore_errors=True)
         self._temporary.mkdir(parents=True)
         self._files = {name: (self._temporary / f"{name}.npy").open("wb") for name in COLUMNS}
@@ -484,11 +484,23 @@ class ColumnWriter:
             for file in self._files.values():
                 file.close()
             if kind is None:
-                if self.directory.exists():
-                    shutil.rmtree(self.directory)
-                os.replace(self._temporary, self.directory)
+                check_target("directory", self.directory)  # again: the collecting may have taken hours
+                self._take_name()
         finally:
             shutil.rmtree(self._temporary, ignore_errors=True)
+
+    def _take_name(self) -> None:
+        """A directory that holds something cannot be renamed onto: the old one steps aside, and goes last."""
+        aside = self.directory.with_name(f".{self.directory.name}.{os.getpid()}.old")
+        if self.directory.exists():
+            os.rename(self.directory, aside)
+        try:
+            os.rename(self._temporary, self.directory)
+        except OSError:
+            if aside.exists():
+                os.rename(aside, self.directory)
+            raise
+        shutil.rmtree(aside, ignore_errors=True)
 
     def _head(self) -> None:
         for name, file in self._files.items():
@@ -498,9 +510,51 @@ class ColumnWriter:
                 file, {"descr": TYPES[name].str, "fortran_order": False, "shape": (self._n,)}
             )  # fmt: skip
 
-    def _replaceable(self) -> bool:
-        names = {f"{name}.npy" for name in COLUMNS}
-        return self.directory.is_dir() and {entry.name for entry in self.directory.iterdir()} <= names
+
+def check_target(key: str, path: str | os.PathLike[str]) -> None:
+    """Raise InputError unless a recording may be written to ``path``: nothing is there, or a recording of ours.
+
+    A directory is of columns and may be empty, a file an npz of the five columns and no more; neither is a link.
+    """
+    target = Path(path)
+    of_columns = key == "directory" or str(path).endswith("/")
+    kind = "directory of columns" if of_columns else "npz of columns"
+    if target.is_symlink():
+        raise InputError(key, path, f"a new {kind}, or one to replace: it is a link")
+    if os.path.lexists(target) and not (_our_columns(target) if of_columns else _our_npz(target)):
+        raise InputError(key, path, f"a new {kind}, or one to replace: what is there is none")
+    parent = target.parent
+    while not os.path.lexists(parent):
+        parent = parent.parent
+    if not parent.is_dir() or not os.access(parent, os.W_OK):
+        raise InputError(key, path, f"where files can be written: {parent} is no such directory")
+
+
+def _our_columns(path: Path) -> bool:
+    entries = list(path.iterdir()) if path.is_dir() else [path]
+    if not entries:
+        return True
+    if {entry.name for entry in entries} != {f"{name}.npy" for name in COLUMNS}:
+        return False
+    columns = {}
+    try:
+        for name in COLUMNS:
+            if (path / f"{name}.npy").is_symlink():
+                return False
+            with (path / f"{name}.npy").open("rb") as file:
+                columns[name] = _NpyColumn(name, file, os.fstat(file.fileno()).st_size)
+    except (OSError, ValueError, UserWarning):
+        return False
+    same_length = len({column.claimed for column in columns.values()}) == 1
+    return same_length and all(columns[name].dtype == TYPES[name] for name in COLUMNS)
+
+
+def _our_npz(path: Path) -> bool:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return sorted(archive.namelist()) == sorted(f"{name}.npy" for name in COLUMNS)
+    except (OSError, zipfile.BadZipFile):
+        return False
 
 
 def save_columns(data: Recording, directory: str | os.PathLike[str]) -> Path:

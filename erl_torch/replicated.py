@@ -35,16 +35,19 @@ from erl_torch.experience import collect
 from erl_torch.files import read_npy, write_json, write_png
 from erl_torch.learners import Exact, NonFiniteError
 from erl_torch.learners.fitting import columns
-from erl_torch.learners.replicas import KEEP_BYTES, Experience, Replicas, ReplicaSolution, Simulation
+from erl_torch.learners.replicas import KEEP_BYTES, TUPLE_BYTES, Experience, Replicas, ReplicaSolution, Simulation
 from erl_torch.mdp import TabularMDP
 from erl_torch.models import known_mdp, sizes
+from erl_torch.recordings import check_target, save_columns
 from erl_torch.rng import streams
 from erl_torch.solution import Status
 from erl_torch.solvers import solve_soft_bellman
 from erl_torch.training import (
     SMALL,
+    Ended,
     SafePoint,
     World,
+    check_sizes,
     episode_model,
     learning_bar,
     make_env,
@@ -101,7 +104,9 @@ def train_replicas(cfg: DictConfig, directory: Path, safe_point: SafePoint, save
         learner = make_learner(cfg.learner, n_states, n_actions)
         if isinstance(learner, Exact):
             raise InputError("learner", "exact", "one that learns from experience: replicas of it would be the same")
+        check_sizes(n_states, n_actions, cfg.n_replicas)
         groups = _groups(cfg)
+        check_sizes(n_states, n_actions, cfg.n_replicas * len(groups))
         threads = cfg.threads or os.cpu_count() or 1
         learners = [_with(learner, group.settings) for group in groups for _ in range(cfg.n_replicas)]
         for one in learners[:: cfg.n_replicas]:
@@ -133,8 +138,10 @@ def train_replicas(cfg: DictConfig, directory: Path, safe_point: SafePoint, save
             began -= found["seconds"]
         logged = [*learners[0].init(n_states, n_actions).metrics(), *first]
         boards = replica_layout({g.name: known for g, known in zip(groups[:MOST_LOGGED], exact, strict=False)}, logged)
-        size = found["events"] if found else 0
-        with saved.refusing(lambda: bool(history)), Board(directory, settings, boards, size) as board:
+        mark = found["events"] if found else None
+        solution: ReplicaSolution | None = None
+        ended = Ended(lambda: solution is not None)
+        with ended, saved.refusing(lambda: bool(history)), Board(directory, settings, boards, mark) as board:
             if not found:
                 board.texts(cfg)
                 record.add(0, first, board)
@@ -151,7 +158,18 @@ def train_replicas(cfg: DictConfig, directory: Path, safe_point: SafePoint, save
                     "digest": stream,
                 }
 
+            def complete() -> dict[str, Any]:
+                """As of ``erl_torch.training.train``; the record's rows are counted, and cut on return."""
+                return {
+                    "state": state,
+                    "evaluation": judge.generators(),
+                    "events": board.mark(),
+                    "learning": learning,
+                    "n": (len(history), record.lengths()),
+                }
+
             passes = getattr(learner, "n_bias", 1) * getattr(learner, "n_epochs", 1)
+            reached = complete()
             try:
                 with learning_bar(passes * n_experience * len(replicas), "tuples") as bar:
                     bar.update(int(history[-1]["n_tuples"].sum()) if history else 0)
@@ -169,17 +187,20 @@ def train_replicas(cfg: DictConfig, directory: Path, safe_point: SafePoint, save
                             record.add(state.n_tuples, measured, board, alive)
                             if milestone:
                                 tqdm.write(f"{milestone}: {record.line()}", file=sys.stderr)
+                        reached = complete()
                         saved.offer(state.n_tuples, snapshot)
                         safe_point()
                         tick = time.perf_counter()
-            except (KeyboardInterrupt, SystemExit) as error:
-                stopped = error
+            except (Exception, KeyboardInterrupt, SystemExit) as error:
+                stopped, state = error, reached["state"]
+                del history[reached["n"][0] :]
+                record.cut(reached["n"][1])
+                if state is None or (not history and isinstance(error, Exception)):
+                    raise  # nothing is learnt
                 if history:
-                    saved.offer(state.n_tuples, snapshot, now=True)
-            if state is None:
-                assert stopped is not None
-                raise stopped
+                    ended.keep(saved, state.n_tuples, lambda: snapshot() | reached)
             solution = replicas.solution(state, history)
+            done = int(history[-1]["n_tuples"].sum())
             title = f"{cfg.env.name}, {cfg.learner.name}: {cfg.n_replicas} replicas"
             drawn = [("bands", record.curves(exact), "tuples streamed, each replica", title)]
             if cfg.vary:
@@ -192,12 +213,13 @@ def train_replicas(cfg: DictConfig, directory: Path, safe_point: SafePoint, save
                 for k, lines in panels.items():  # on TensorBoard's small cards one panel can be read
                     card = pictures.bands({QUANTITIES[k]: lines}, x_label, heading, markers, card=True)
                     board.picture(f"{name}/{k}", card, state.n_tuples)
-            done = int(history[-1]["n_tuples"].sum())
             board.scalars({"time/tuples_per_second": done / max(learning, 1e-9)}, state.n_tuples)
             board.scalars(_final(groups, record, exact), state.n_tuples)
             if solution.failures:
                 board.failed()
 
+    stopped = stopped or ended.error
+    assert solution is not None
     solution.save(directory / "replicas.npz", record.arrays() | {"seed": np.array(seeds), **_columns(groups)})
     objectives = [record.statistics(group).get("objective") for group in groups]
     result = {
@@ -207,6 +229,7 @@ def train_replicas(cfg: DictConfig, directory: Path, safe_point: SafePoint, save
         "n_replicas": cfg.n_replicas,
         "vary": _plain(cfg.vary),
         "status": Status.STOPPED.name.lower() if stopped else _status(solution),
+        "message": f"{type(stopped).__name__}: {stopped}" if isinstance(stopped, Exception) else "",
         "failures": {str(r): str(error) for r, error in solution.failures.items()},
         "objective": max((found["mean"] for found in objectives if found), default=None),  # of the best group
         "groups": [
@@ -247,6 +270,8 @@ def _groups(cfg: DictConfig) -> list[Group]:
             raise InputError(f"vary.{key}", values, f"left out: the settings of the learner are {able}")
         if not column or not all(checks.is_number(value) for value in column):
             raise InputError(f"vary.{key}", values, "a list of numbers")
+        if any(abs(value) > checks.MOST for value in column if isinstance(value, int)):
+            raise InputError(f"vary.{key}", values, "whole numbers below 2**63")
         columns[key] = column
     found = []
     for i, values in enumerate(itertools.product(*columns.values())):
@@ -293,12 +318,18 @@ def _experience(
         raise InputError("experience.save_to", e.save_to, "null: there is a stream a replica (or shared_stream=true)")
     behaviour = None if e.behaviour_policy is None else read_npy(e.behaviour_policy, "experience.behaviour_policy")
     if shared:
+        if e.save_to is not None:
+            check_target("experience.save_to", e.save_to)
         data = collect(world.source, e.n_episodes, e.episode_length, cfg.seed, behaviour, prior)
         if e.save_to is not None:
-            data.save(e.save_to)
+            check_target("experience.save_to", e.save_to)
+            save_columns(data, e.save_to) if e.save_to.endswith("/") else data.save(e.save_to)
         return data
     mdp = known_mdp(world.source)
     if mdp is not None:
+        if cfg.keep_tuples:
+            held = TUPLE_BYTES * len(seeds) * e.n_episodes * e.episode_length
+            checks.memory("keep_tuples", "true", held, f"the tuples of {len(seeds):,} replicas")
         return Simulation(mdp, e.n_episodes, e.episode_length, seeds, behaviour, cfg.keep_tuples)
     made: dict[int, Transitions] = {}
     for seed in tqdm(sorted(set(seeds)), desc="collecting", unit=" streams", delay=1, leave=False, disable=None):
@@ -462,6 +493,19 @@ class _Record:
     def content(self) -> tuple[Any, ...]:
         """What a checkpoint keeps."""
         return self.prior, self.steps, *({k: np.stack(v) for k, v in x.items()} for x in (self.rows, self.alive))
+
+    def lengths(self) -> dict[str, int]:
+        """Records so far, by quantity."""
+        return {name: len(steps) for name, steps in self.steps.items()}
+
+    def cut(self, lengths: Mapping[str, int]) -> None:
+        """Back to what it was at ``lengths``."""
+        for of_names in (self.steps, self.rows, self.alive):
+            for name in list(of_names):
+                if name in lengths:
+                    del of_names[name][lengths[name] :]
+                else:
+                    del of_names[name]
 
     def restore(self, content: tuple[Any, ...]) -> None:
         """Go on from ``content``."""

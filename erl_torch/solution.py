@@ -138,16 +138,16 @@ class Solution:
     def of_arrays(cls, arrays: Mapping[str, np.ndarray], path: str | os.PathLike[str]) -> Solution:
         """The solution of ``arrays``, read from ``path``. Raises InputError naming the file."""
         values: dict[str, Any] = {"history": {}}
-        for name, array in arrays.items():
-            if name.startswith("history/"):
-                values["history"][name.removeprefix("history/")] = array
-            elif name == "theta_bounds":
-                values[name] = (float(array[0]), float(array[1]))
-            elif array.ndim:
-                values[name] = torch.from_numpy(array)
-            else:
-                values[name] = array.item()
         try:
+            for name, array in arrays.items():
+                if name.startswith("history/"):
+                    values["history"][name.removeprefix("history/")] = array
+                elif name == "theta_bounds":
+                    values[name] = (float(array[0]), float(array[1]))
+                elif array.ndim:
+                    values[name] = torch.from_numpy(array)
+                else:
+                    values[name] = array.item()
             return cls(**(values | {"status": Status[values["status"]]}))
-        except (KeyError, TypeError) as error:
+        except (IndexError, KeyError, TypeError, ValueError) as error:
             raise InputError("path", path, f"a solution as Solution.save writes it ({error})") from error

@@ -8,7 +8,6 @@ jobs' ``result.json``, at the end of a sweep and whenever ``python -m erl_torch.
 from __future__ import annotations
 
 import contextlib
-import json
 import logging
 import math
 import re
@@ -19,6 +18,7 @@ import time
 from collections.abc import Iterator, Sequence
 from itertools import count, takewhile
 from pathlib import Path
+from types import NoneType
 from typing import Any
 
 from hydra.core.config_store import ConfigStore
@@ -28,7 +28,8 @@ from hydra.plugins.launcher import Launcher
 from omegaconf import DictConfig
 
 from erl_torch.checks import InputError
-from erl_torch.files import alone, write_json
+from erl_torch.files import alone, read_json, write_json
+from erl_torch.output import lasting
 
 EXTRAS = {"joblib": "joblib", "submitit_slurm": "slurm", "submitit_local": "slurm", "optuna": "optuna"}
 COLUMNS = ("theta", "objective", "gap", "seconds")  # of result.json
@@ -81,17 +82,45 @@ def _note(sweep: Path, number: int) -> Path:
 def _read(path: Path) -> dict[str, Any]:
     """A JSON file, or nothing where there is none that can be read."""
     try:
-        found: dict[str, Any] = json.loads(path.read_text())
-    except (OSError, ValueError):
+        return read_json(path, "path", "") or {}
+    except InputError:
         return {}
-    return found
+
+
+def _rows(sweep: Path) -> list[dict[str, Any]]:
+    """The table of ``sweep.json``. Raises InputError where there is none, or a damaged one."""
+    path = sweep / "sweep.json"
+    otherwise = "the same command again makes it anew"
+    found = read_json(path, "directory", otherwise)
+    if found is None:
+        raise InputError("directory", sweep, "that of a sweep: it holds a sweep.json")
+    rows = found.get("jobs")
+    if not (isinstance(rows, list) and rows and all(map(_is_row, rows))):
+        raise InputError("directory", path, f"what a sweep writes: a row of every job; {otherwise}")
+    return rows
+
+
+def _is_row(row: Any) -> bool:
+    return (
+        isinstance(row, dict)
+        and isinstance(row.get("job"), int)
+        and isinstance(row.get("overrides"), list)
+        and all(isinstance(o, str) for o in row["overrides"])
+        and isinstance(row.get("status"), str)
+        and all(isinstance(row.get(key), (str, NoneType)) for key in ("directory", "complaint"))
+    )
+
+
+def _figure(value: Any) -> float | None:
+    """A number of a ``result.json``; None for anything else."""
+    return value if isinstance(value, (int, float)) and not isinstance(value, bool) else None
 
 
 def _plan(sweep: Path, jobs: dict[int, list[str]], anew: bool) -> None:
     """Add jobs to the table; ``anew`` forgets those of an earlier sweep in this directory."""
     if anew:
         shutil.rmtree(sweep / ".jobs", ignore_errors=True)
-    rows = [] if anew else _read(sweep / "sweep.json")["jobs"]
+    rows = [] if anew else _rows(sweep)
     rows += [{"job": n, "overrides": overrides, "status": "waiting"} for n, overrides in jobs.items()]
     write_json(sweep / "sweep.json", {"jobs": rows})
 
@@ -104,18 +133,16 @@ def collect(sweep: Path) -> list[dict[str, Any]]:
         objective, gap, seconds and directory; None where there is no such figure.
 
     Raises:
-        InputError: ``sweep`` holds no ``sweep.json``.
+        InputError: ``sweep`` holds no ``sweep.json``, or a damaged one.
     """
-    rows: list[dict[str, Any]] = _read(sweep / "sweep.json").get("jobs", [])
-    if not rows:
-        raise InputError("directory", sweep, "that of a sweep: it holds a sweep.json")
+    rows = _rows(sweep)
     for row in rows:
-        said = _read(_note(sweep, row["job"]))
-        row |= {key: said.get(key, row.get(key)) for key in ("status", "complaint", "directory")}
+        said = row | _read(_note(sweep, row["job"]))
+        row |= {key: (said if _is_row(said) else row).get(key) for key in ("status", "complaint", "directory")}
         result = _read(sweep / row["directory"] / "result.json") if row["directory"] else {}
-        row |= {key: result.get(key) for key in COLUMNS}
+        row |= {key: _figure(result.get(key)) for key in COLUMNS}
         if row["status"] == "ended":
-            row["status"] = result.get("status", "completed")
+            row["status"] = str(result.get("status", "completed"))
         if row["directory"] and not (sweep / row["directory"]).exists():
             row["directory"] = None  # bad input: nothing was written
     write_json(sweep / "sweep.json", {"jobs": rows})
@@ -327,6 +354,7 @@ def show(sweep: Path) -> list[dict[str, Any]]:
 
 
 def main(arguments: Sequence[str]) -> int:
+    lasting()
     if len(arguments) != 1:
         print("usage: python -m erl_torch.sweeps DIRECTORY", file=sys.stderr)
         return 2

@@ -12,7 +12,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -40,7 +40,7 @@ from erl_torch.learners import LEARNERS, Exact, ExactState, NonFiniteError, S1St
 from erl_torch.learners.fitting import columns
 from erl_torch.mdp import TabularMDP, check_policy
 from erl_torch.models import MeanRewardWarning, absorbing, known_mdp, sizes, tabular_mdp
-from erl_torch.recordings import FileRecording, open_recording
+from erl_torch.recordings import FileRecording, check_target, open_recording
 from erl_torch.rng import Streams, streams
 from erl_torch.solution import Solution, Status
 from erl_torch.solvers import certify, solve_soft_bellman
@@ -48,6 +48,8 @@ from erl_torch.transitions import Recording
 from erl_torch.uncertainty import Estimate, theta_uncertainty
 
 SafePoint = Callable[[], None]
+TABLES = 8  # of a learner's size, about, while it learns and is evaluated
+REPLICA_BYTES = 10_000  # of a replica, besides: generators and settings
 SMALL = 2000  # states of an empirical model that is solved beside every run
 NOT_ARGUMENTS = ("name", "id", "suggest", "stream", "n_samples", "model_seed")
 
@@ -67,8 +69,9 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
     check_keys(cfg)
     checks.at_least("seed", cfg.seed, 0)
     checks.at_least("n_replicas", cfg.n_replicas, 1)
+    checks.at_least("seed + n_replicas", cfg.seed + cfg.n_replicas, 1)  # seeds count on from the first
     if cfg.threads is not None:
-        checks.at_least("threads", cfg.threads, 1)
+        checks.workers("threads", cfg.threads)
     if cfg.checkpoint_every is not None and not cfg.checkpoint_every >= 0:
         raise InputError("checkpoint_every", cfg.checkpoint_every, "seconds >= 0, or null")
     many = cfg.n_replicas > 1 or cfg.vary
@@ -127,8 +130,10 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
         lines = evaluation_tags(first, "prior") | _optimal_tags(best, judge, episode, horizon) | _data_tags(estimate)
         boards = layout([*run.names(start), *evaluation_tags(first)], lines)
         settings = hyperparameters(cfg, n_experience=run.n_experience)
-        size = found["events"] if found else 0
-        with saved.refusing(lambda: bool(history)), Board(directory, settings, boards, size) as board:
+        mark = found["events"] if found else None
+        solution: Solution | None = None
+        ended = Ended(lambda: solution is not None)
+        with ended, saved.refusing(lambda: bool(history)), Board(directory, settings, boards, mark) as board:
             board.lines(lines)
             drawer = _Drawer(board, getattr(env.unwrapped, "grid", None)) if cfg.evaluation.pictures else None
             if not found:
@@ -150,6 +155,12 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
                     "digest": run.digest,
                 }
 
+            def complete() -> dict[str, Any]:
+                """What an epoch left when all was done that belongs to it: an error may come in the midst of that."""
+                now = {"state": state, "first": first, "last": last, "events": board.mark(), "n": len(history)}
+                return now | {"evaluation": rng.evaluation.bit_generator.state, "learning": clock.seconds}
+
+            reached = complete()
             # Whatever ends the loop, what was learnt until then is written below.
             try:
                 with run.bar() as bar:
@@ -169,14 +180,21 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
                         bar.update(step - bar.n)
                         if milestone:
                             _say(milestone, state, last)
+                        reached = complete()
                         if run.digest is not None:
                             saved.offer(step, snapshot)
                         safe_point()
-            except (NonFiniteError, KeyboardInterrupt, SystemExit) as error:
+            except (Exception, KeyboardInterrupt, SystemExit) as error:
                 stopped = error
+                state, last = reached["state"], reached["last"]
+                del history[reached["n"] :]
+                if not history and not isinstance(error, (NonFiniteError, KeyboardInterrupt, SystemExit)):
+                    raise  # nothing is learnt
                 if run.digest is not None and history and not isinstance(error, NonFiniteError):
-                    saved.offer(run.step(state), snapshot, now=True)
+                    ended.keep(saved, run.step(state), lambda: snapshot() | {**reached, "history": columns(history)})
             solution = run.solution(state, history, stopped)
+            if isinstance(stopped, Exception) and not isinstance(stopped, NonFiniteError):
+                solution = replace(solution, message=f"{type(stopped).__name__}: {stopped}")
             if best is not None:
                 assert judge is not None
                 solution = certify(solution, judge, learner.beta, prior, best)
@@ -191,6 +209,8 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
             if isinstance(stopped, NonFiniteError):
                 board.failed()
 
+    stopped = stopped or ended.error
+    assert solution is not None
     solution.save(directory / "solution.npz")
     seconds = time.perf_counter() - began
     result = _result(cfg, solution, last, run.n_experience, clock.seconds, seconds)
@@ -203,6 +223,35 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
         raise stopped
     saved.clear()
     return result
+
+
+class Ended:
+    """Around the end of a run: what goes wrong once there is something to save is kept in ``error`` until it is saved.
+
+    Args:
+        learnt: whether there is.
+    """
+
+    def __init__(self, learnt: Callable[[], bool]) -> None:
+        self.learnt = learnt
+        self.error: Exception | None = None
+
+    def __enter__(self) -> Ended:
+        return self
+
+    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> bool:
+        if not isinstance(error, Exception) or not self.learnt():
+            return False
+        self.error = error
+        return True
+
+    @staticmethod
+    def keep(saved: Checkpoints, step: int, content: Callable[[], dict[str, Any]]) -> None:
+        """A checkpoint now; where even that fails, the rest can still be saved."""
+        try:
+            saved.offer(step, content, now=True)
+        except Exception as error:
+            print(f"warning: no checkpoint of tuple {step:,} ({type(error).__name__}: {error})", file=sys.stderr)
 
 
 class World(NamedTuple):
@@ -282,7 +331,15 @@ class _Learning:
 
     def optimum(self, judge: TabularMDP | None, prior: np.ndarray) -> Solution | None:
         """The exact answer to ``judge``, to compare with."""
-        return None if judge is None else solve_soft_bellman(judge, self.learner.beta, prior)
+        if judge is None:
+            return None
+        try:
+            return solve_soft_bellman(judge, self.learner.beta, prior)
+        except (MemoryError, RuntimeError) as error:  # what factorisations need shows as they go
+            if not checks.out_of_memory(error):
+                raise
+            allowed = f"false: the exact solution of this model needs more memory than there is ({error})"
+            raise InputError("evaluation.certify", "true", allowed) from error
 
     def uncertainty(self, prior: np.ndarray) -> Estimate | None:
         """theta* with its error, as the counts of the stream alone have it; None where that is no small problem."""
@@ -454,10 +511,15 @@ def make_env(cfg: DictConfig, render_mode: str | None = None) -> gym.Env[Any, An
             arguments["render_mode"] = render_mode
         try:
             env = gym.make(cfg.id, **arguments)
-        except gym.error.Error as error:
+        except InputError:
+            raise
+        except (gym.error.Error, ImportError) as error:
             raise InputError("id", cfg.id, f"an environment that Gymnasium has ({error})") from error
-        except TypeError as error:
-            raise InputError("kwargs", arguments, f"arguments of {cfg.id} ({error})") from error
+        except Exception as error:  # whatever an environment answers arguments with
+            if checks.out_of_memory(error):
+                raise
+            said = f"{type(error).__name__}: {error}"
+            raise InputError("kwargs", arguments, f"arguments of {cfg.id} ({said})") from error
         binning = {key: keys.get(key) for key in ("bins", "low", "high", "actions")}
         if "kwargs" in keys and any(value is not None for value in binning.values()):
             return Discretise(env, **binning)
@@ -534,8 +596,23 @@ def make_learner(cfg: DictConfig, n_states: int, n_actions: int, key: str = "lea
         if cfg.prior_policy is not None:
             arguments["prior_policy"] = read_npy(cfg.prior_policy, "prior_policy")
         learner = learner_class(**arguments)
+    check_sizes(n_states, n_actions)
+    with _group(key):
         learner.init(n_states, n_actions)  # validates the prior against the sizes
         return learner
+
+
+def check_sizes(n_states: int, n_actions: int, n_replicas: int = 1) -> None:
+    """Raise InputError unless pairs have numbers of 32 bits, and the tables of a learner find room."""
+    n_pairs = n_states * n_actions
+    if n_pairs >= 2**31:
+        raise InputError("n_states * n_actions", f"{n_states} * {n_actions}", "below 2**31")
+    needed = n_replicas * (8 * TABLES * n_pairs + REPLICA_BYTES)
+    what = f"{n_states:,} states and {n_actions:,} actions, in {TABLES} tables"
+    if n_replicas > 1:
+        checks.memory("n_replicas", n_replicas, needed, f"a learner each, of {what}")
+    else:
+        checks.memory("n_states * n_actions", f"{n_states} * {n_actions}", needed, what)
 
 
 def recorded(
@@ -589,6 +666,8 @@ def _experience(
         behaviour = None
         if cfg.behaviour_policy is not None:
             behaviour = read_npy(cfg.behaviour_policy, "behaviour_policy")
+        if cfg.save_to is not None:
+            check_target("save_to", cfg.save_to)
         total = cfg.n_episodes * cfg.episode_length if cfg.n_episodes >= 1 and cfg.episode_length >= 1 else 0
         with _collecting("collecting", total, safe_point) as report:
             arguments = cfg.n_episodes, cfg.episode_length, rng, behaviour, prior, report
@@ -596,6 +675,7 @@ def _experience(
                 return open_recording(record(source, cfg.save_to, *arguments), n_states, n_actions)
             data = collect(source, *arguments)
         if cfg.save_to is not None:
+            check_target("save_to", cfg.save_to)  # again: the collecting may have taken hours
             data.save(cfg.save_to)
         return data
 
@@ -604,6 +684,7 @@ def _check_evaluation(cfg: DictConfig) -> None:
     with _group("evaluation"):
         for key in ("every", "n_episodes", "horizon", "exact_up_to"):
             checks.at_least(key, cfg[key], 1)
+        checks.memory("n_episodes", cfg.n_episodes, 8 * cfg.n_episodes, "the returns of all episodes")
 
 
 # -- what is shown ----------------------------------------------------------------------------------

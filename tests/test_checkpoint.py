@@ -1,6 +1,7 @@
 """A run that is ended at any moment and started again is the run that was not: same bits, one event file."""
 
 import json
+import pydoc
 from pathlib import Path
 
 import numpy as np
@@ -152,6 +153,191 @@ def test_other_settings_are_refused_by_name(cut):
     assert {path: path.read_bytes() for path in directory.rglob("*") if path.is_file()} == before
 
 
+def files(directory):
+    return {path: path.read_bytes() for path in directory.rglob("*") if path.is_file()}
+
+
+def test_checkpoints_know_their_settings(tmp_path, cut):
+    cfg, directory, _ = cut
+    (directory / "settings.json").unlink()
+    before = files(directory)
+    with pytest.raises(InputError, match=r"not learner\.beta=7\.0 \(there: 10\.0\)"):
+        train(composed(*SMALL, *SHORT["s1"], "learner.beta=7"), directory)
+    assert files(directory) == before
+    train(cfg, directory)
+    train(cfg, tmp_path / "whole")
+    assert (directory / "solution.npz").read_bytes() == (tmp_path / "whole/solution.npz").read_bytes()
+    assert names(directory) == names(tmp_path / "whole")
+
+
+def test_checkpoints_of_another_version_stay(cut, monkeypatch):
+    cfg, directory, _ = cut
+    monkeypatch.setattr("erl_torch.checkpoint.FORMAT", 3)
+    before = files(directory)
+    with pytest.raises(
+        InputError, match=r"checkpoint=.*12000.ckpt: must be of this version \(it is of format 2, not 3"
+    ):
+        train(cfg, directory)
+    assert files(directory) == before
+
+
+@pytest.mark.parametrize("damaged", ["result.json", "settings.json"])
+@pytest.mark.parametrize("content", ["", '{"status": "comp', "[]", "3", "{}", "\udcff", None])
+def test_a_damaged_file_is_named_and_all_else_stays(tmp_path, damaged, content):
+    """... of a complete run, which began anew and deleted its log. None is a directory, as of a botched copy."""
+    cfg = composed(*SMALL, *SHORT["s1"])
+    train(cfg, tmp_path)
+    (tmp_path / damaged).unlink()
+    if content is None:
+        (tmp_path / damaged).mkdir()
+    else:
+        (tmp_path / damaged).write_bytes(content.encode(errors="surrogateescape"))
+    before = files(tmp_path)
+    with pytest.raises(
+        InputError, match="{}|of a run with these settings".format(damaged.replace(".", r"\."))
+    ) as error:
+        train(cfg, tmp_path)
+    assert "\n" not in str(error.value)
+    assert files(tmp_path) == before
+
+
+def test_results_of_unknown_settings_stay(tmp_path):
+    train(composed(*SMALL, *SHORT["s1"]), tmp_path)
+    (tmp_path / "settings.json").unlink()
+    for name in ("result.json", "solution.npz"):
+        before = files(tmp_path)
+        with pytest.raises(InputError, match=f"it holds a {name} without the settings.json behind it"):
+            train(composed(*SMALL, *SHORT["s1"], "learner.beta=7"), tmp_path)
+        assert files(tmp_path) == before
+        (tmp_path / name).unlink()
+
+
+def test_a_log_that_is_not_the_run_s_own_stays(tmp_path):
+    EventFile(tmp_path).close()
+    (other,) = tmp_path.iterdir()
+    other = other.rename(other.with_name("events.out.tfevents.1.other"))
+    with pytest.raises(InputError):
+        train(
+            composed("learner=certainty_equivalence", "experience.n_episodes=1", "experience.episode_length=1"),
+            tmp_path,
+        )
+    assert [*tmp_path.iterdir()] == [other]
+    train(composed(*SMALL, *SHORT["s1"]), tmp_path)
+    assert other.exists()
+    assert len(list(tmp_path.glob("events.*"))) == 2
+
+
+@pytest.mark.parametrize("damage", ["cut", "deleted", "empty", "grown"])
+def test_the_log_may_be_damaged_before_a_run_goes_on(tmp_path, cut, capsys, damage):
+    cfg, directory, _ = cut
+    train(cfg, tmp_path / "whole")
+    (log,) = directory.glob("events.*")
+    body = log.read_bytes()
+    old = scalars(directory)["s1/theta"]
+    if damage == "deleted":
+        log.unlink()
+    else:
+        log.write_bytes({"cut": body[: len(body) // 2], "empty": b"", "grown": body + body[:1000]}[damage])
+    kept = scalars(directory).get("s1/theta", []) if damage != "deleted" else []
+    train(cfg, directory)
+    assert (directory / "solution.npz").read_bytes() == (tmp_path / "whole/solution.npz").read_bytes()
+    whole = scalars(tmp_path / "whole")["s1/theta"]
+    said = capsys.readouterr().err.count("has lost what it held at the checkpoint")
+    assert names(directory) == names(tmp_path / "whole")
+    if damage == "grown":
+        assert said == 0
+        assert scalars(directory)["s1/theta"] == whole
+    else:
+        assert said == 1
+        assert len(kept) < len(old)
+        assert scalars(directory)["s1/theta"] == kept + whole[len(old) :]
+
+
+class Bug(Exception):
+    pass
+
+
+@pytest.mark.parametrize(
+    ("place", "error", "replicas"),
+    [
+        ("learner", Bug("why"), ()),
+        ("learner", MemoryError("Unable to allocate 9 TiB"), ()),
+        ("evaluation", Bug("why"), ()),
+        ("log", OSError(28, "No space left on device"), ()),
+        ("learner", Bug("why"), ("n_replicas=2",)),
+        ("evaluation", MemoryError(), ("n_replicas=2",)),
+        ("log", Bug("why"), ("n_replicas=2",)),
+    ],
+)
+def test_any_error_keeps_what_was_learnt(tmp_path, monkeypatch, error, place, replicas):
+    """... as it was after the last whole epoch, wherever in the next one it came."""
+    cfg = composed(*SMALL, *SHORT["s1"], *replicas)
+    train(cfg, tmp_path / "whole")
+    module = "replicated" if replicas else "training"
+    target, name = {
+        "learner": (AlgorithmS1, "step") if not replicas else (Replicas, "iterate"),
+        "evaluation": (f"erl_torch.{module}._Judges", "__call__") if replicas else ("erl_torch.training", "evaluate"),
+        "log": ("erl_torch.board.Board", "scalars"),
+    }[place]
+    if isinstance(target, str):
+        target = pydoc.locate(target)
+    before = getattr(target, name)
+    calls = 0
+
+    def failing(*arguments, **more):
+        nonlocal calls
+        calls += 1
+        if (place, replicas) == ("learner", ("n_replicas=2",)):
+            return broken(before(*arguments, **more))
+        if calls == (40 if (place, replicas) == ("log", ("n_replicas=2",)) else 5):
+            raise error
+        return before(*arguments, **more)
+
+    def broken(states):
+        for n, state in enumerate(states):
+            if n == 4:
+                raise error
+            yield state
+
+    with monkeypatch.context() as patch:
+        patch.setattr(target, name, failing)
+        with pytest.raises(type(error)) as raised:
+            train(cfg, tmp_path / "cut")
+    assert raised.value is error
+    result = json.loads((tmp_path / "cut" / "result.json").read_text())
+    assert result["status"] == "stopped"
+    assert result["message"] == f"{type(error).__name__}: {error}"
+    table = "replicas.npz" if replicas else "solution.npz"
+    assert (tmp_path / "cut" / table).exists()
+    assert list((tmp_path / "cut" / "checkpoints").glob("*.ckpt"))
+    train(cfg, tmp_path / "cut")
+    assert (tmp_path / "cut" / table).read_bytes() == (tmp_path / "whole" / table).read_bytes()
+    assert scalars(tmp_path / "cut") == scalars(tmp_path / "whole")
+
+
+def test_an_error_after_the_learning_keeps_it(tmp_path, monkeypatch):
+    def failing(*_):
+        raise MemoryError
+
+    monkeypatch.setattr("erl_torch.training.certify", failing)
+    with pytest.raises(MemoryError):
+        train(composed(*SMALL, *SHORT["s1"]), tmp_path)
+    assert json.loads((tmp_path / "result.json").read_text())["status"] == "completed"
+    assert Solution.load(tmp_path / "solution.npz").status is Status.COMPLETED
+
+
+def test_a_certificate_beyond_memory_is_named(tmp_path, monkeypatch):
+    def failing(*_):
+        raise MemoryError("SuperLU: not enough memory")
+
+    monkeypatch.setattr("erl_torch.training.solve_soft_bellman", failing)
+    with pytest.raises(
+        InputError, match=r"^evaluation.certify=true: must be false: .* needs more memory than there is"
+    ):
+        train(composed(*SMALL, *SHORT["s1"]), tmp_path)
+    assert not any(tmp_path.iterdir())
+
+
 def test_another_stream_is_refused(tmp_path):
     mdp = random_mdp(np.random.default_rng(0), 4, 2)
     mdp.save(tmp_path / "mdp.npz")
@@ -236,8 +422,7 @@ def test_event_file_is_cut_and_gone_on_with(tmp_path):
     file.close()
     assert [(e.step, e.value) for e in events(tmp_path).Scalars("x")] == [(1, 1.0), (2, 3.0)]
     assert len(list(tmp_path.iterdir())) == 1
-    EventFile(tmp_path, 10**9).close()  # shorter than it was: it cannot be gone on with
-    assert events(tmp_path).Tags()["scalars"] == []
+    assert file.fresh is False
 
 
 @pytest.mark.parametrize("value", ["-1", "nan"])

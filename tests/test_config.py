@@ -2,15 +2,17 @@
 
 import math
 import re
+import resource
 from dataclasses import fields
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from erl_torch import InputError, cli, config
+from erl_torch import InputError, checks, cli, config
 from erl_torch.checks import InputError as ChecksInputError
 from erl_torch.learners import LEARNERS
 from erl_torch.training import train
@@ -140,6 +142,81 @@ def test_bad_values_get_one_line_that_names_them(tmp_path, key):
         assert "\n" not in line
         assert len(line) > len(key) + 10
         assert list(tmp_path.iterdir()) == []
+
+
+TOO_LARGE = "1" + "0" * 30  # beyond 64 bits
+COUNTS = ["seed", "n_replicas", "threads", "learner.n_epochs", "learner.n_bias", "learner.max_psi_epochs"]
+COUNTS += ["learner.rescale_every", "experience.n_episodes", "experience.episode_length", "evaluation.every"]
+COUNTS += ["evaluation.n_episodes", "evaluation.horizon", "evaluation.exact_up_to"]
+
+
+@pytest.mark.parametrize("key", COUNTS)
+def test_whole_numbers_beyond_64_bits_are_named(tmp_path, key):
+    assert complaint(tmp_path, f"{key}={TOO_LARGE}") == f"{key}={TOO_LARGE}: must be below 2**63"
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("override", "expected"),
+    [
+        ("experience.n_episodes=1000000000000", "experience.n_episodes=1000000000000: must be smaller: a stream of"),
+        ("experience.episode_length=1000000000000", "experience.n_episodes=500: must be smaller: a stream of"),
+        ("n_replicas=1000000000", "n_replicas=1000000000: must be smaller: a learner each"),
+        ("evaluation.n_episodes=1000000000000", "evaluation.n_episodes=1000000000000: must be smaller: the returns"),
+        ("threads=100000", "threads=100000: must be at most 1024"),
+        ("env=windy_maze env.size=1000000", "env.size=1000000: must be smaller: a maze of"),
+        ("env=pendulum env.bins=40000 env.n_samples=1", "env.bins=[40000, 40000]: must be smaller: a model of"),
+        ("n_replicas=1000 keep_tuples=true experience.n_episodes=100000000", "keep_tuples=true: must be smaller"),
+        (f"n_replicas=2 seed={2**63 - 2}", f"seed + n_replicas={2**63}: must be below 2**63"),
+        (f"vary.beta=[{TOO_LARGE}]", f"vary.beta=[{TOO_LARGE}]: must be whole numbers below 2**63"),
+    ],
+)
+def test_sizes_are_refused_before_anything_is_allocated(tmp_path, override, expected):
+    line = complaint(tmp_path, *(f"++{o}" if o.startswith("vary") else o for o in override.split()))
+    assert line.startswith(expected)
+    if "smaller" in expected:
+        assert re.search(r"needs \S+ GB of memory, and \S+ GB are free$", line)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_free_memory_is_within_the_process_s_own_limit():
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (used + 2**30, before[1]))
+    try:
+        assert 0 < checks.free_memory() <= 2**30
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
+    checks.memory("x", 1, 1000, "a table")
+    with pytest.raises(InputError, match=r"x=1e31: must be smaller: it needs more than 1e291 GB of memory, and"):
+        checks.memory("x", 10**31, 10**400, "it")
+
+
+def test_counts_are_whole_numbers_of_64_bits():
+    for value in (math.nan, math.inf, -1, 0.5, True, "3", None, 2**63, 10**5000):
+        with pytest.raises(InputError, match=r"^n=.*: must be (a whole number >= 0|below 2\*\*63)$"):
+            checks.at_least("n", value, 0)
+    for good in (0, 3.0, np.int32(5), 2**63 - 1):
+        checks.at_least("n", good, 0)
+
+
+@pytest.mark.parametrize(
+    ("message", "expected"),
+    [
+        (MemoryError("Unable to allocate 9 TiB"), True),
+        (
+            RuntimeError("DefaultCPUAllocator: can't allocate memory"),
+            True,
+        ),
+        (RuntimeError("CUDA out of memory. Tried to allocate 2 GiB"), True),
+        (RuntimeError("a bug"), False),
+    ],
+)
+def test_want_of_memory_is_one_line(message, expected):
+    assert checks.out_of_memory(message) is expected
+    assert cli.expected(message) is expected
+    if expected:
+        assert re.fullmatch(r"memory: not enough \(.*\)", cli._line(message))
 
 
 @pytest.mark.parametrize("group", ["", *(f"{g}." for g in config.SCHEMAS)])

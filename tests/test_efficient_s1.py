@@ -371,3 +371,9 @@ def test_online_loss_falls_to_that_of_certainty_equivalence():
     online = np.mean(online, axis=0)
     assert online[-1] < 2 * np.mean(limit)
     assert online[-1] < online[0]
+
+
+def test_clocks_of_any_accepted_settings_have_steps():
+    for horizon, floor in ((1e308, 1e-308), (1e308, 1.0), (1.0, 5e-324)):
+        steps = EfficientS1(clock_horizon=horizon, clock_floor=floor).steps()
+        assert ((steps > 0) & (steps <= 1)).all()

@@ -1,5 +1,6 @@
 """Learnt policies in their environments: figures, text and pictures, and what is refused."""
 
+import contextlib
 import shutil
 import subprocess
 import sys
@@ -180,13 +181,15 @@ def test_bad_runs_get_one_line(cliff, tmp_path):
             ("- 3", "config.yaml ("),
             ("seed: 0", "Missing key env"),
             ("env: {name: x}\nlearner: {name: s1}\nevaluation: {horizon: 1}", "Missing key id"),
+            (b"\xff\xfe\xfa", "config.yaml ("),
+            ("a: ${b}", "config.yaml ("),
         ]
     ):
         run = tmp_path / str(i)
         shutil.copytree(cliff, run)
         (run / ".hydra" / "config.yaml").unlink()
         if text is not None:
-            (run / ".hydra" / "config.yaml").write_text(text)
+            (run / ".hydra" / "config.yaml").write_bytes(text if isinstance(text, bytes) else text.encode())
         line = complaint(f"run={run}")
         assert line.startswith(f"run={run}: must be a run directory with the configuration")
         assert expected in line
@@ -194,6 +197,42 @@ def test_bad_runs_get_one_line(cliff, tmp_path):
     assert "policy fits its environment (policy=array of shape (3, 2)" in complaint(f"run={misfit}")
     (misfit / "solution.npz").write_bytes(b"PK junk")
     assert "readable npz" in complaint(f"run={misfit}")
+
+
+def test_modules_are_imported_only_if_named_again(cliff, tmp_path, monkeypatch):
+    (tmp_path / "mine.py").write_text(
+        "from gymnasium import register\nregister('Mine-v0', entry_point='erl_torch.envs.windy_cliff:WindyCliffEnv')\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    policy = Solution.load(cliff / "solution.npz").policy
+    run = copy(cliff, tmp_path / "run", policy, "env=gym", "env.id='mine:Mine-v0'", "env.name=mine")
+    for module in ("null", "other"):
+        with pytest.raises(InputError, match=r"module=.*: must be mine, which makes the run's environment"):
+            play(arguments(f"run={run}", f"module={module}", "n_episodes=1"))
+    assert "mine" not in sys.modules
+    assert len(play(arguments(f"run={run}", "module=mine", "n_episodes=1", "render=none")).returns) == 1
+    assert "mine" in sys.modules
+    with pytest.raises(InputError, match="module=mine: must be left out"):
+        play(arguments(f"run={cliff}", "module=mine"))
+
+
+def test_sizes_beyond_memory_are_refused_first(cliff):
+    with pytest.raises(InputError, match=r"n_episodes=\d+: must be smaller: the returns .* GB are free"):
+        play(arguments(f"run={cliff}", f"n_episodes={10**15}"))
+
+
+@pytest.mark.parametrize("field", ["theta_bounds", "policy", "status", "psi"])
+def test_solutions_with_a_wrong_field_are_refused(cliff, tmp_path, field):
+    arrays = Solution.load(cliff / "solution.npz").arrays()
+    for i, value in enumerate([np.array("text"), np.array(["text"]), np.zeros(0)]):
+        np.savez(tmp_path / f"{i}.npz", **arrays | {field: value})
+        with contextlib.suppress(InputError):
+            Solution.load(tmp_path / f"{i}.npz")
+    np.savez(
+        tmp_path / "r.npz", **{"policy": np.zeros((2, 3, 1)), "psi": np.zeros(3), "status": np.array(["STOPPED"] * 2)}
+    )
+    with pytest.raises(InputError, match="as many rows in every array"):
+        ReplicaSolution.load(tmp_path / "r.npz")
 
 
 def test_command_line(cliff, tmp_path):

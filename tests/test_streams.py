@@ -3,6 +3,7 @@
 import contextlib
 import io
 import json
+import os
 import re
 import warnings
 from dataclasses import fields
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import random_mdp
+from test_config import composed
 
 from erl_torch import (
     AlgorithmS1,
@@ -28,8 +30,9 @@ from erl_torch import (
 )
 from erl_torch.empirical import empirical_mdp, tally
 from erl_torch.learners import LEARNERS
-from erl_torch.recordings import ColumnWriter
+from erl_torch.recordings import ColumnWriter, check_target
 from erl_torch.rng import streams
+from erl_torch.training import train
 from erl_torch.transitions import COLUMNS, Parts, regroup
 
 MDP = random_mdp(np.random.default_rng(0), 5, 3)
@@ -278,7 +281,7 @@ def test_columns_are_written_whole_or_not_at_all(tmp_path):
     assert len(open_recording(path, 5, 3)) == 40
     assert [p.name for p in (tmp_path / "deep").iterdir()] == ["t"]
     (path / "notes.txt").write_text("mine")
-    with pytest.raises(InputError, match="must be new, empty, or one of columns"):
+    with pytest.raises(InputError, match="what is there is none"):
         save_columns(SHORT, path)
     assert (path / "notes.txt").exists()
 
@@ -451,3 +454,80 @@ def test_minari_episodes_become_tuples(tmp_path, monkeypatch):
         open_recording("minari:erl/test-v0", 2, 3)
     with pytest.raises(InputError, match="none-v0: must be a readable Minari data set"):
         open_recording("minari:erl/none-v0", 5, 3)
+
+
+def kept(path):
+    """Everything at ``path``, links by where they lead."""
+    entries = [path, *(path.rglob("*") if path.is_dir() and not path.is_symlink() else [])]
+    return {p: p.readlink() if p.is_symlink() else p.is_dir() or p.read_bytes() for p in entries}
+
+
+def test_save_to_replaces_recordings_and_nothing_else(tmp_path):
+    def run(target, *replicas):
+        small = ("experience.n_episodes=1", "experience.episode_length=100", "learner.n_bias=1", "learner.n_epochs=1")
+        small += ("evaluation.pictures=false", f"experience.save_to={target}")
+        cfg = composed(*small, *replicas)
+        train(cfg, tmp_path / f"run{len(list(tmp_path.iterdir()))}")
+
+    text, model, more, folder = (tmp_path / name for name in ("notes.txt", "mdp.npz", "more.npz", "folder"))
+    text.write_text("mine")
+    MDP.save(model)
+    np.savez(more, **vars(SHORT), mine=np.ones(3))
+    folder.mkdir()
+    (folder / "s.npy").write_text("mine")
+    SHORT.save(tmp_path / "elsewhere.npz")
+    save_columns(SHORT, tmp_path / "elsewhere")
+    link, link_to_columns = tmp_path / "link.npz", tmp_path / "columns"
+    link.symlink_to(tmp_path / "elsewhere.npz")
+    link_to_columns.symlink_to(tmp_path / "elsewhere")
+    half = tmp_path / "half"  # columns by name, of another type
+    half.mkdir()
+    for name in ("s", "a", "r", "s_next", "a_next"):
+        np.save(half / f"{name}.npy", np.zeros((2, 2)))
+    links = [f"{link_to_columns}/", link]
+    targets = [text, model, more, folder, text / "y.npz", *links, *(f"{path}/" for path in (folder, half, text))]
+    before = kept(tmp_path)
+    for target in targets:
+        with pytest.raises(InputError, match=r"^experience.save_to="):
+            check_target("experience.save_to", target)
+    with pytest.raises(InputError, match=r"^experience.save_to="):
+        run(text)
+    with pytest.raises(InputError, match=r"^experience.save_to="):
+        run(text, "shared_stream=true", "++vary.beta=[1,2]")
+    assert kept(tmp_path) == before
+    for target in [tmp_path / "new.npz", f"{tmp_path}/new/"] * 2:
+        run(target)
+        assert len(open_recording(target, 15, 4)) == 100
+    assert not [p for p in tmp_path.iterdir() if p.name.startswith(".")]
+
+
+def test_the_old_recording_stays_until_the_new_one_is_whole(tmp_path, monkeypatch):
+    save_columns(SHORT, tmp_path / "t")
+    before = kept(tmp_path)
+    rename = os.rename
+
+    def failing(source, target):
+        if str(source).endswith(".tmp"):
+            raise OSError(28, "No space left on device")
+        rename(source, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "rename", failing)
+        with pytest.raises(OSError, match="No space left"):
+            save_columns(PLAIN, tmp_path / "t")
+    assert kept(tmp_path) == before
+    save_columns(PLAIN, tmp_path / "t")
+    assert len(open_recording(tmp_path / "t", 5, 3)) == len(PLAIN)
+
+
+def test_streams_whose_length_shows_late_are_refused_before_they_fill_the_memory(monkeypatch):
+    env = gym.make("FrozenLake-v1")
+    monkeypatch.setattr("erl_torch.checks.free_memory", lambda: 0.479e6)  # nearly 20,000 tuples
+    with pytest.raises(InputError, match=r"n_episodes=1000000: must be smaller: .* needs 0.00048 GB of memory"):
+        collect(env, 10**6, 10**6, 0)
+    assert len(collect(env, 100, 10**6, 0)) < 10**4
+    vector = gym.make_vec("FrozenLake-v1", 2)
+    with pytest.raises(InputError, match="n_episodes=100000000: must be smaller"):
+        collect(vector, 10**8, 10**8)
+    with pytest.raises(InputError, match="GB of disk, and"):
+        record(MDP, "nowhere/t", 10**10, 10**10)

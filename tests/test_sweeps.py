@@ -125,6 +125,41 @@ def test_every_launcher_runs_all_jobs_and_lists_all_failures(tmp_path, toy):
         sweeps.collect(tmp_path)
 
 
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b'{"jobs": [',
+        b"[]",
+        b"\xff",
+        b'{"jobs": []}',
+        b'{"jobs": {}}',
+        b'{"jobs": [1]}',
+        b'{"jobs": [{"job": 0}]}',
+    ],
+)
+def test_a_damaged_table_is_named_and_stays(tmp_path, content, capsys):
+    (tmp_path / "sweep.json").write_bytes(content)
+    assert sweeps.main([str(tmp_path)]) == 1
+    out, err = capsys.readouterr()
+    assert err.startswith(f"error: directory={tmp_path}/sweep.json: must be ")
+    assert err.count("\n") == 1
+    assert not out
+    assert (tmp_path / "sweep.json").read_bytes() == content
+
+
+@pytest.mark.parametrize("content", ["", "[]", '{"status": 5, "directory": 7}', '{"directory": "0"}'])
+def test_damaged_notes_and_results_leave_their_figures_out(tmp_path, content):
+    rows = [{"job": 0, "overrides": ["x=1"], "status": "waiting"}]
+    (tmp_path / "sweep.json").write_text(json.dumps({"jobs": rows}))
+    (tmp_path / ".jobs").mkdir()
+    (tmp_path / ".jobs" / "0.json").write_text(content)
+    (tmp_path / "0").mkdir()
+    (tmp_path / "0" / "result.json").write_text('{"theta": "x", "objective": [], "status": 4}')
+    (row,) = sweeps.show(tmp_path)
+    assert (row["theta"], row["objective"]) == (None, None)
+
+
 def test_optuna_maximises_the_objective_past_failed_trials(tmp_path, toy):
     search = ["hydra/sweeper=optuna", "hydra.sweeper.n_trials=6", "hydra.sweeper.sampler.seed=0"]
     process = toy("-m", *search, "end=unlucky", "x=interval(0,1)", "hydra.sweep.dir=here")

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import ROOT, random_mdp
+from omegaconf import OmegaConf
 from test_board import events, undocumented
 from test_config import composed
 
@@ -313,6 +314,59 @@ def test_errors_are_one_line(typed_here, tmp_path, argument, code, start):
     assert err.count("\n") == 1
     assert out == ""
     assert not list(tmp_path.rglob("runs/*"))
+
+
+def test_a_refused_command_leaves_the_run_s_own(typed_here, tmp_path):
+    """Hydra writes its files before the work begins: those of a refused command took the place of the run's."""
+    arguments = (*SMALL, "evaluation.pictures=false", "hydra.run.dir=run")
+    assert typed_here("train.py", *arguments)[0] == 0
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    code, _, err = typed_here("train.py", *arguments, "learner.beta=7")
+    assert code == 1
+    assert "not learner.beta=7.0 (there: 10.0)" in err
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+    code, _, err = typed_here("train.py", "resume=run", "threads=2")  # no result depends on it
+    assert code == 0
+    assert "is complete" in err
+    assert OmegaConf.load(tmp_path / "run/.hydra/config.yaml").threads == 2
+    for name in ("settings.json", "result.json", "solution.npz"):  # nothing but Hydra's files is left
+        (tmp_path / "run" / name).unlink()
+    assert typed_here("train.py", "resume=run", "learner.beta=-1")[0] == 1
+    assert OmegaConf.load(tmp_path / "run/.hydra/config.yaml").learner.beta == 10
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        (b"", "the list of the arguments that the run began with"),
+        (b"\xff\xfe", "a readable list of the arguments that the run began with"),
+        (b"- env: [\n", "a readable list of the arguments that the run began with"),
+        (b"- {a: 1}\n", "the list of the arguments that the run began with"),
+        (b"- hydra.callbacks.x._target_=mine.Class\n", "that of a run: 'hydra.callbacks.x._target_=mine.Class' in its"),
+        (
+            b"- ++hydra/launcher=joblib\n",
+            "that of a run: '++hydra/launcher=joblib' in its",
+        ),
+        (b"- --config-dir=/elsewhere\n", "that of a run: '--config-dir=/elsewhere' in its"),
+        (b"- env=mine:Id-v0\n", "named with its module, which is imported: add env=mine:Id-v0"),
+        (b"- env=gym\n- env.id='mine:Id-v0'\n", "named with its module, which is imported: add env=mine:Id-v0"),
+        (b"- 'env={id: \"mine:Id-v0\"}'\n", "named with its module, which is imported"),
+    ],
+)
+def test_resume_takes_only_what_a_run_begins_with(typed_here, tmp_path, monkeypatch, content, expected):
+    (tmp_path / "mine.py").write_text("raise SystemExit('imported')\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    path = tmp_path / "run" / ".hydra" / "overrides.yaml"
+    path.parent.mkdir(parents=True)
+    path.write_bytes(content)
+    code, _, err = typed_here("train.py", "resume=run")
+    assert code == 1
+    assert err.startswith("error: resume=run")
+    assert expected in err
+    assert err.count("\n") == 1
+    assert path.read_bytes() == content
+    if "module" in expected and b"- env=" in content:
+        assert typed_here("train.py", "resume=run", "env=mine:Id-v0")[0] == "imported"
 
 
 def test_help_is_complete_and_needs_no_torch(tmp_path):

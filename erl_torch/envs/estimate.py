@@ -35,6 +35,7 @@ from erl_torch.mdp import TabularMDP
 
 FORMAT = 1  # of the cache; goes up whenever the same settings give another model
 CHUNK = 32_000  # samples at once: they fit a core's cache, and torch starts no threads for fewer than 32,768
+ROW_BYTES = 100  # of a cell and action, with a transition or two
 MOST_SAMPLES = 1_000_000  # a row, which is the least that a chunk holds
 STARTS = ("reset", "uniform")
 
@@ -91,8 +92,9 @@ def estimate_mdp(
     checks.device("device", device)
     if workers is None:
         workers = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    checks.at_least("workers", workers, 1)
+    checks.workers("workers", workers)
     job = _Job(task, space, values, int(n_samples), int(seed), torch.device(device))
+    checks.memory("bins", list(space.bins), ROW_BYTES * job.n_rows, f"a model of {job.n_rows:,} cells and actions")
     counts = job.cached() if cache else None
     if counts is None:
         total, hidden = job.n_rows * job.n_samples, None if progress else True

@@ -23,6 +23,7 @@ from erl_torch.checks import InputError
 from erl_torch.envs.grid_world import GridWorld
 
 SWEEPS = 5
+CELL_BYTES = 2500  # of a tile, while its model is made
 BATCH_NUMBERS = 4_000_000  # random numbers in memory at once
 
 
@@ -74,6 +75,7 @@ def random_mazes(
         if not (checks.is_number(density) and 0 <= density < np.inf):
             raise InputError("density", density, "a finite number >= 0")
         n_traps = round(size * density)
+    checks.memory("size", size, CELL_BYTES * size**2, f"a maze of {size} x {size} tiles and its model")
     layout, free = _layout(size)
     checks.at_least("n_traps", n_traps, 0)
     if n_traps > free.size:

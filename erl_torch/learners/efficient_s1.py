@@ -545,7 +545,7 @@ class EfficientS1:
         """The step of a pair's n-th visit in a biasing iteration, n = 0, 1, ...; the last entry stays."""
         if not self.clocks:
             return np.array([self.lr_u])
-        n = np.arange(min(math.ceil(self.clock_horizon * (1 / self.clock_floor - 1)), LAST_STEP) + 1)
+        n = np.arange(math.ceil(min(self.clock_horizon * (1 / self.clock_floor - 1), LAST_STEP)) + 1)
         return np.asarray(np.maximum(self.clock_floor, self.clock_horizon / (self.clock_horizon + n)))
 
     def _u_epoch(self, state: EfficientState, stream: EfficientStream) -> tuple[np.ndarray, np.ndarray, float]:

@@ -148,7 +148,10 @@ class ReplicaSolution:
         known = [f.name for f in fields(Solution) if f.name in arrays]
         if "policy" not in known:
             raise InputError("path", path, "the solutions of replicas as ReplicaSolution.save writes them")
-        rows = ({name: arrays[name][r] for name in known} for r in range(len(arrays["policy"])))
+        n = {len(arrays[name]) if arrays[name].ndim else -1 for name in known}
+        if len(n) > 1 or -1 in n:
+            raise InputError("path", path, "the solutions of replicas, as many rows in every array")
+        rows = ({name: arrays[name][r] for name in known} for r in range(n.pop()))
         return cls(tuple(Solution.of_arrays(row, path) for row in rows))
 
 
@@ -179,9 +182,10 @@ class Replicas:
         for learner in self.learners:
             if type(learner) is not type(self.learners[0]):
                 raise InputError("learners", type(learner).__name__, f"all {type(self.learners[0]).__name__}")
-        for name in ("threads", "block"):
-            if getattr(self, name) is not None:
-                checks.at_least(name, getattr(self, name), 1)
+        if self.threads is not None:
+            checks.workers("threads", self.threads)
+        if self.block is not None:
+            checks.at_least("block", self.block, 1)
         checks.one_of("layout", self.layout, ("auto", "lanes", "tables"))
         checks.one_of("backend", self.backend, ("auto", "compiled", "torch"))
         if self.backend == "torch" and not isinstance(self.learners[0], AlgorithmS1):

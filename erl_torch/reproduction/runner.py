@@ -62,7 +62,8 @@ def reproduce(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] =
     checks.one_of("artifact", cfg.artifact, (*ARTIFACTS, "all"))
     checks.one_of("scale", cfg.scale, SCALES)
     checks.at_least("seed", cfg.seed, 0)
-    checks.at_least("processes", cfg.processes, 1)
+    checks.workers("processes", cfg.processes)
+    checks.processes("processes", cfg.processes)
     torch.set_num_threads(1)
     names = list(ARTIFACTS) if cfg.artifact == "all" else [cfg.artifact]
     outputs = run([load(name) for name in names], directory, cfg.scale, cfg.seed, cfg.processes, safe_point)
