@@ -23,13 +23,13 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 import erl_torch
-from erl_torch import checks, kernels, pictures
+from erl_torch import checks, kernels, pictures, reservations
 from erl_torch.board import Board, hyperparameters, layout
 from erl_torch.chains import SingularChainError
 from erl_torch.checkpoint import Checkpoints, rows_of
 from erl_torch.checks import InputError
 from erl_torch.config import check_keys
-from erl_torch.empirical import empirical_mdp
+from erl_torch.empirical import empirical_mdp, tally
 from erl_torch.envs.discretise import Discretise
 from erl_torch.envs.estimate import estimate_mdp
 from erl_torch.envs.grid_world import GridWorld
@@ -40,6 +40,7 @@ from erl_torch.learners import LEARNERS, Exact, ExactState, NonFiniteError, S1St
 from erl_torch.learners.fitting import columns
 from erl_torch.mdp import TabularMDP, check_policy
 from erl_torch.models import MeanRewardWarning, absorbing, known_mdp, sizes, tabular_mdp
+from erl_torch.notes import collected, note
 from erl_torch.recordings import FileRecording, check_target, open_recording
 from erl_torch.rng import Streams, streams
 from erl_torch.solution import Solution, Status
@@ -94,7 +95,7 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
             raise InputError(key, cfg[key], "left out, or used with n_replicas > 1 or vary.KEY=[...]")
     rng = streams(cfg.seed)
     env = make_env(cfg.env)
-    with contextlib.closing(env):
+    with collected() as notes, contextlib.closing(env):
         world = make_world(cfg.env, env, safe_point)
         judge = world.mdp
         if judge is not None and judge.transition.nnz > cfg.evaluation.exact_up_to:
@@ -119,6 +120,11 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
         best = run.optimum(judge, prior) if e.certify else None
         estimate = run.uncertainty(prior) if e.certify else None
         episode = episode_model(env, world)
+        for line in run.reservations(prior):
+            note(line)
+        if estimate is not None and best is not None and best.theta_bounds is not None:
+            for line in reservations.of_model(estimate.value, estimate.standard_error, best.theta_bounds):
+                note(line)
         found = run.check(saved.start())
         if found:
             state, first, last = (found[key] for key in ("state", "first", "last"))
@@ -201,6 +207,12 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
             else:
                 for step in (0, run.step(state)):
                     board.scalars(_optimal_tags(solution, judge, episode, horizon), step)
+            for line in reservations.of_outcome(
+                solution.status,
+                last.objective,
+                -np.inf if judge is None else first.objective,  # sampled: too noisy
+            ):
+                note(line)
             rate = run.step(state) / max(clock.seconds, 1e-9)
             board.scalars({f"time/{run.unit}_per_second": rate}, run.step(state))
             final = {"theta": solution.theta, "gap": solution.gap}
@@ -217,6 +229,7 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
     result["data"] = None if estimate is None else str(estimate)
     result["data_smallest_visits"] = None if estimate is None else estimate.smallest_visits
     result["n_skipped"] = run.n_skipped
+    result["notes"] = notes
     write_json(directory / "result.json", result)
     print(_summary(cfg, first, last, start, result, directory, run.unit))
     if stopped is not None:
@@ -329,6 +342,18 @@ class _Learning:
         solution: Solution = self.learner.solution(state, history, failure)
         return solution
 
+    def reservations(self, prior: np.ndarray) -> list[str]:
+        """What the stream does not allow the learner."""
+        is_s1 = self.name == "s1"
+        lines = reservations.of_rewards(tally(self.data, *self.sizes), is_s1)
+        if is_s1:
+            n_states, n_actions = self.sizes
+            counts = np.zeros(n_states * n_actions, np.int64)
+            for chunk in self.data.chunks():
+                counts += np.bincount(chunk.s_next * np.int64(n_actions) + chunk.a_next, minlength=len(counts))
+            lines += reservations.of_next_actions(counts.reshape(n_states, n_actions), prior)
+        return lines
+
     def optimum(self, judge: TabularMDP | None, prior: np.ndarray) -> Solution | None:
         """The exact answer to ``judge``, to compare with."""
         if judge is None:
@@ -373,6 +398,9 @@ class _Solving:
                 "learner", "exact", f"one that learns from experience: no model of {cfg.env.name} is known"
             )
         self.learner, self.mdp = learner, world.mdp
+
+    def reservations(self, prior: np.ndarray) -> list[str]:
+        return []
 
     def check(self, found: dict[str, Any] | None) -> None:
         return None
@@ -763,9 +791,8 @@ def _summary(
     done = result[f"n_{unit}"]
     is_s1 = isinstance(start, S1State)
     rows = [
-        *([("theta", f"{start.theta:12.5f}", f"{result['theta']:12.5f}")] if is_s1 else []),
-        *([("theta", f"{'':12}", f"{result['theta']:12.5f}")] if not is_s1 and result["theta"] is not None else []),
-        *([("rho", f"{start.rho:12.4e}", f"{result['rho']:12.4e}")] if is_s1 else []),
+        *([("theta", f"{-first.objective:12.5f}", f"{result['theta']:12.5f}")] if result["theta"] is not None else []),
+        *([("rho", f"{'-':>12}", f"{result['rho']:12.4e}")] if is_s1 and result["rho"] is not None else []),
         ("reward per step", f"{first.reward_per_step:12.5f}", f"{last.reward_per_step:12.5f}"),
         ("objective", f"{first.objective:12.5f}", f"{last.objective:12.5f}"),
         ("episode return", f"{first.mean_return:12.2f}", f"{last.mean_return:12.2f}"),
@@ -795,6 +822,7 @@ def _summary(
         f"{'run directory':18}{directory}",
         f"{'look at it':18}tensorboard --logdir {logs}",
     ]
+    lines += [f"{'note':18}{text}" for text in result["notes"]]
     if result["status"] not in ("completed", "converged"):
         lines.append(f"{'status':18}{Status[result['status'].upper()].value}")
         lines += [f"{'':18}{result['message']}"] if result["message"] else []
