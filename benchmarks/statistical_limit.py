@@ -28,6 +28,7 @@ from erl_torch import (
     AlgorithmS1,
     CertaintyEquivalence,
     EfficientS1,
+    ListedS1,
     TabularMDP,
     Transitions,
     collect,
@@ -91,8 +92,8 @@ def write(what: str, command: str, text: str, header: Sequence[str], rows: list[
 def cliff(command: str, n_seeds: int = 20) -> None:
     exact = solve_soft_bellman(CLIFF, 10.0)
     learners: dict[str, Any] = {
-        "published S1, as the authors' script reads it": AlgorithmS1(rho_init="carry", self_loop="old"),
-        "published S1, as listed": AlgorithmS1(),
+        "published S1, as the authors' script reads it": AlgorithmS1(),
+        "published S1, as listed": ListedS1(),
         "EfficientS1, 15 epochs x 6": EfficientS1(n_epochs=15, n_bias=6),
         "EfficientS1, defaults (3 x 30)": EfficientS1(),
         "certainty equivalence": CertaintyEquivalence(),

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from erl_torch.envs.rollout import collect_rollouts, rollout
     from erl_torch.evaluation import Evaluation, evaluate
     from erl_torch.experience import collect, record
-    from erl_torch.learners.algorithm_s1 import AlgorithmS1, S1State
+    from erl_torch.learners.algorithm_s1 import AlgorithmS1, ListedS1, S1State
     from erl_torch.learners.certainty_equivalence import CertaintyEquivalence
     from erl_torch.learners.efficient_s1 import EfficientS1
     from erl_torch.learners.fitting import NonFiniteError
@@ -44,6 +44,7 @@ _HOME = {
     "Recording": "transitions",
     "Evaluation": "evaluation",
     "InputError": "checks",
+    "ListedS1": "learners.algorithm_s1",
     "MeanRewardWarning": "models",
     "NonFiniteError": "learners.fitting",
     "ReplicaSolution": "learners.replicas",
@@ -84,6 +85,7 @@ __all__ = [
     "Evaluation",
     "FileRecording",
     "InputError",
+    "ListedS1",
     "MeanRewardWarning",
     "NonFiniteError",
     "Recording",

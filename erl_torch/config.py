@@ -132,13 +132,22 @@ class S1:
     psi_tol: float = 1e-4
     max_psi_epochs: int = 10_000
     prior_policy: str | None = None
-    rho_init: str = "reset"
-    self_loop: str = "new"
+    rho_init: str = "carry"
+    self_loop: str = "old"
     clip_rho: bool = True
     rescale_every: int | None = None
     unvisited: str = "initial"
     implementation: str = "fast"
     device: str = "cpu"
+
+
+@dataclass
+class S1Listing(S1):
+    """The arguments of ``erl_torch.ListedS1``; prior_policy is a file here."""
+
+    name: str = "s1_listing"
+    rho_init: str = "reset"
+    self_loop: str = "new"
 
 
 @dataclass
@@ -338,6 +347,7 @@ SCHEMAS: dict[str, dict[str, type]] = {
     },
     "learner": {
         "s1": S1,
+        "s1_listing": S1Listing,
         "s1_efficient": S1Efficient,
         "certainty_equivalence": CertaintyEquivalence,
         "differential_soft_q": DifferentialSoftQ,

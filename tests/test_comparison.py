@@ -218,7 +218,7 @@ def test_every_learner_can_be_compared():
         (["learners=[]"], "learners=[]: must be at least one"),
         (["seeds=0"], "seeds=0: must be a whole number >= 1"),
         (["beta=-1"], "learner.s1.beta=-1.0: must be a finite number > 0"),
-        (["learner.s1.beta=5"], "s1_efficient: beta=10.0: must be that of s1, 5"),
+        (["learner.s1.beta=5"], "s1_listing: beta=10.0: must be that of s1, 5"),
         (["learner.s1.lr_u=7"], "learner.s1.lr_u=7.0: must be"),
         (["+learner.s1.lr=7"], "learner.s1.lr"),
         (["+learner.s3.lr=7"], "learner.s3"),

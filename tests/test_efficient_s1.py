@@ -14,6 +14,7 @@ from erl_torch import (
     AlgorithmS1,
     CertaintyEquivalence,
     EfficientS1,
+    ListedS1,
     InputError,
     NonFiniteError,
     Status,
@@ -54,7 +55,7 @@ def test_with_every_option_off_it_is_algorithm_s1(problem, beta, lr_u, lr_psi, n
     data = random_stream(rng, mdp, 300)
     data = with_noise(data, rng, 0.1) if noisy else data
     options = dict(beta=beta, lr_u=lr_u, lr_psi=lr_psi, prior_policy=prior, n_epochs=2, n_bias=3)
-    paper = AlgorithmS1(**options).fit(data, *mdp.reward.shape)
+    paper = ListedS1(**options).fit(data, *mdp.reward.shape)
     ours = EfficientS1.published(**options, log_domain=log_domain).fit(data, *mdp.reward.shape)
     assert ours.status is paper.status
     assert ours.theta == pytest.approx(paper.theta, rel=1e-9, abs=1e-9)

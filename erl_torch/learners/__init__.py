@@ -14,7 +14,7 @@ from erl_torch.learners.action_value import (
     SoftQ,
     ULearning,
 )
-from erl_torch.learners.algorithm_s1 import AlgorithmS1, S1State
+from erl_torch.learners.algorithm_s1 import AlgorithmS1, ListedS1, S1State
 from erl_torch.learners.certainty_equivalence import CertaintyEquivalence, CertaintyEquivalenceState
 from erl_torch.learners.efficient_s1 import EfficientS1, EfficientState
 from erl_torch.learners.exact import Exact, ExactState
@@ -23,6 +23,7 @@ from erl_torch.learners.z_learning import ZLearning
 
 LEARNERS: dict[str, Any] = {
     "s1": AlgorithmS1,
+    "s1_listing": ListedS1,
     "differential_soft_q": DifferentialSoftQ,
     "rvi_soft_q": RVISoftQ,
     "u_learning": ULearning,
@@ -69,6 +70,7 @@ __all__ = [
     "EfficientState",
     "Exact",
     "ExactState",
+    "ListedS1",
     "NonFiniteError",
     "QLearning",
     "RVISoftQ",

@@ -34,7 +34,8 @@ Exact rearrangements used by ``implementation="fast"`` (the literal twin is ``er
                 g = exp(beta (r - Delta) - <log psi> + log psi(s)) holds all of lines 9-11.
     division    with q = 1/rho line 11 is q <- q z' / ((1-lr_rho) z' + lr_rho g z(s',a') q): one division.
 
-What the listing leaves open, and what is done here
+What the listing leaves open, and what is done here. ``AlgorithmS1`` reads points 4 and 7 as the authors' script does,
+which made the published Figure 5; ``ListedS1`` is the same class with the listing's readings for defaults.
 
 1. lr_rho has no value in the listing: None is lr_u / n_states, as in the authors' script.
 2. Rescaling u is not in the listing: neutral, since the updates are homogeneous in u. Every
@@ -182,8 +183,8 @@ class AlgorithmS1:
         psi_tol: relative error between epochs that ends a psi phase.
         max_psi_epochs: limit on the epochs of a psi phase.
         prior_policy: [S, A], rows sum to 1 and every entry > 0; None is uniform.
-        rho_init: "reset" (line 8 in each biasing iteration) or "carry" (only in the first).
-        self_loop: "new" or "old": which u(s',a') line 11 sees where (s',a') = (s,a).
+        rho_init: "carry" (line 8 only in the first biasing iteration: the script) or "reset" (in each: the listing).
+        self_loop: which u(s',a') line 11 sees where (s',a') = (s,a): "old" (the script) or "new" (the listing).
         clip_rho: keep rho <= max(1, exp(beta max r)).
         rescale_every: tuples between rescalings of u; None is max(5000, S*A).
         unvisited: "initial" or "prior": what a pair without visits keeps.
@@ -205,8 +206,8 @@ class AlgorithmS1:
     psi_tol: float = 1e-4
     max_psi_epochs: int = 10_000
     prior_policy: torch.Tensor | np.ndarray | None = None
-    rho_init: str = "reset"
-    self_loop: str = "new"
+    rho_init: str = "carry"
+    self_loop: str = "old"
     clip_rho: bool = True
     rescale_every: int | None = None
     unvisited: str = "initial"
@@ -537,6 +538,15 @@ class AlgorithmS1:
 
 def _inverse(x: float) -> float:
     return 1 / x if x else math.inf
+
+
+@dataclass(frozen=True, eq=False)
+class ListedS1(AlgorithmS1):
+    """``AlgorithmS1`` with the listing's readings for defaults: rho is reset in every biasing iteration (line 8), and
+    line 11 sees the u that line 10 has written."""
+
+    rho_init: str = "reset"
+    self_loop: str = "new"
 
 
 def _walkable(table: torch.Tensor) -> torch.Tensor | np.ndarray:

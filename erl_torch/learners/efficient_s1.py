@@ -15,7 +15,7 @@ on the empirical model: the fixed point is certainty equivalence, and its loss g
 The published steps stay about a hundred times further away: their <psi> remembers the last ten visits, and their
 backup is noisy also at the end.
 
-Options, each alone (published: all off, ``unvisited="initial"``; then this *is* Algorithm S1, tested)
+Options, each alone (published: all off, ``unvisited="initial"``; then this *is* ``ListedS1``, tested)
 
     1. ``sample_mean_psi``  <psi> and <log psi> are means over all visits (step 1/n), from counts: no passes, and with
                             them lr_psi, psi_tol and max_psi_epochs go. Off: lines 2-3.
@@ -39,7 +39,7 @@ Options, each alone (published: all off, ``unvisited="initial"``; then this *is*
                             V and pi are the state's own: its policy's loss there is not above that. Off: all passes.
     9. ``unvisited``        "exclude": the problem is that of ``erl_torch.empirical``: pairs never visited have
                             probability 0, states outside keep the prior. "initial": u = 1 of line 7.
-The self-loop and the clip of rho are those of ``AlgorithmS1``'s defaults (``self_loop="new"``, ``clip_rho``).
+The self-loop and the clip of rho are those of ``ListedS1`` (``self_loop="new"``, ``clip_rho``).
 
 Online (``online``): one pass over a stream without end, no tuple kept: S*A numbers, and the counts n(s,a,s') that
 occur. The stream is cut into phases that end at 10 S A tuples times powers of ``phase_growth``; V is fixed in a phase,
