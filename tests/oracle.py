@@ -39,3 +39,22 @@ def biasing_iterations(p, r, prior, beta, n):
         iterates.append(Iterate(psi, mean_psi, mean_log_psi, delta, rho, u, policy, theta))
         psi = 1 / (prior * u).sum(1)  # eq. (7)
     return iterates
+
+
+class Lines9To11(NamedTuple):
+    """What lines 9-11 make of a stream in iteration 0, where psi = 1 and there is no bias."""
+
+    u: np.ndarray  # [S, A], not rescaled
+    rho: float
+    largest: float  # rho of all tuples, before it was clipped
+
+
+def lines_9_to_11(data, shape, beta, lr_u, lr_rho, rho_max=np.inf):
+    """One pass, tuple by tuple, line 11 with the u that line 10 has just written."""
+    u, rho, largest = np.ones(shape), np.exp(-beta), -np.inf
+    for s, a, r, s_next, a_next in zip(data.s, data.a, data.r, data.s_next, data.a_next, strict=True):
+        u[s, a] += lr_u * (np.exp(beta * r) * u[s_next, a_next] / rho - u[s, a])
+        rho += lr_rho * (np.exp(beta * r) * u[s_next, a_next] / u[s, a] - rho)
+        largest = max(largest, rho)
+        rho = min(rho, rho_max)
+    return Lines9To11(u, rho, largest)

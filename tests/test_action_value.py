@@ -274,6 +274,16 @@ def test_one_pass_of_differential_soft_q_on_the_cliff(cliff):
     assert gap[ULearning] > 0.05
 
 
+def test_the_reference_is_the_state_visited_most():
+    rng = np.random.default_rng(0)
+    s = np.array([2] * 60 + [0] * 30 + [1] * 10)
+    data = Transitions(s, rng.integers(2, size=100), -rng.random(100), rng.integers(3, size=100), 0 * s)
+    *_, chosen = RVISoftQ(beta=2.0, n_epochs=2).iterate(data, 3, 2)
+    for reference in range(3):
+        *_, given = RVISoftQ(beta=2.0, n_epochs=2, reference=reference).iterate(data, 3, 2)
+        assert torch.equal(given.q, chosen.q) == (reference == 2)
+
+
 # -- what a learner does with gaps and bad input ---------------------------------------------------------
 
 
