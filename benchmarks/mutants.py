@@ -200,9 +200,8 @@ MUTANTS = [
     Mutant(
         "a piece of the lanes is cut out twice",
         "kernels.py",
-        "            pair, pair_next, factor, noisy, g, z, q, lr_u, lr_rho, inv_rho_min, new, step_k, step_lane, t - begin,\n",
-        "            pair[begin:], pair_next[begin:], factor, noisy, g, z, q, lr_u, lr_rho, inv_rho_min, new, step_k, step_lane,\n"
-        "            t - begin,\n",
+        "_lanes_rows(\n            pair, pair_next, factor, noisy,",
+        "_lanes_rows(\n            pair[begin:], pair_next[begin:], factor, noisy,",
         "test_replicas.py::test_rewards_that_vary_are_cut_without_a_trace",
     ),
     # -- kernels: EfficientS1
@@ -342,7 +341,7 @@ MUTANTS = [
         "kernels.py",
         "x[k] += x[i] * p[i, k]",
         "x[k] += x[i] * p[k, i]",
-        "test_action_value.py::test_gth_is_the_lu_where_both_work",
+        "test_action_value.py::test_gth_and_lu_are_the_stationary_distribution",
     ),
     # -- kernels: mazes, counts
     Mutant(
@@ -655,8 +654,8 @@ MUTANTS = [
     Mutant(
         "states that lead to lost states are kept",
         "empirical.py",
-        "            if (used.any(1) == alive).all():\n                break\n            alive = np.asarray(used.any(1))\n",
-        "            alive = np.asarray(used.any(1))\n            break\n",
+        "                break\n            alive = np.asarray(used.any(1))\n",
+        "                break\n            alive = np.asarray(used.any(1))\n            break\n",
         "test_certainty_equivalence.py::test_states_that_lead_nowhere_are_left_out_and_keep_the_prior",
     ),
     Mutant(
@@ -838,6 +837,147 @@ MUTANTS = [
         "if size and before:",
         "test_checkpoint.py::test_event_file_is_cut_and_gone_on_with",
     ),
+    # -- exact solvers, chains, evaluation
+    Mutant(
+        "the gap is the width of the bounds",
+        "solvers/result.py",
+        "gap = theta_bounds(value, backed_up, problem.reward)[1] - bounds[0]",
+        "gap = bounds[1] - bounds[0]",
+        "test_certificates.py::test_the_gap_is_of_the_policy_whatever_proved_the_bounds",
+    ),
+    Mutant(
+        "a policy's gap counts from the wrong bound",
+        "solvers/result.py",
+        "max(-bounds[0] - gain, 0.0)",
+        "max(-bounds[1] - gain, 0.0)",
+        "test_certificates.py::test_a_certified_gap_counts_from_the_end_that_no_policy_passes",
+    ),
+    Mutant(
+        "biasing has the bounds of its last value",
+        "solvers/biasing.py",
+        "lower, upper = max(lower, proven[0]), min(upper, proven[1])",
+        "lower, upper = proven",
+        "test_certificates.py::test_bounds_of_biasing_iterations_are_the_best_so_far",
+    ),
+    Mutant(
+        "the chain stays cut at a rare state",
+        "kernels.py",
+        "                    ref = order[np.argmax(x)]\n",
+        "                    break\n",
+        "test_certificates.py::test_the_cut_is_moved_off_a_state_that_is_hardly_ever_met",
+    ),
+    Mutant(
+        "way back to the cut is lost in elimination",
+        "kernels.py",
+        "absorbed = row[ref]",
+        "absorbed = 0.0",
+        "test_certificates.py::test_the_cut_is_moved_off_a_state_that_is_hardly_ever_met",
+    ),
+    Mutant(
+        "KL of the tilted dynamics without its mean",
+        "kernels.py",
+        "kl[row] = max(average - log_total, 0.0)",
+        "kl[row] = max(average, 0.0)",
+        "test_certificates.py::test_a_tilted_row_is_as_defined",
+    ),
+    Mutant(
+        "power iteration ends when u alone has",
+        "kernels.py",
+        "if moving_v < 0 and _moving(u, new_u, 0, bound) < 0:",
+        "if True:",
+        "test_maze_counts.py::test_power_iteration_is_the_plain_one",
+    ),
+    Mutant(
+        "delta in nats, not in reward",
+        "solvers/result.py",
+        "problem.transition @ log_psi, 0.0) / problem.beta",
+        "problem.transition @ log_psi, 0.0)",
+        "test_solvers.py::test_biasing_iterations_are_the_dense_ones",
+    ),
+    Mutant(
+        "rho without Delta",
+        "solvers/result.py",
+        "rho = float(np.exp(-beta * (theta + delta)))",
+        "rho = float(np.exp(-beta * theta))",
+        "test_solvers.py::test_three_routes_agree",
+    ),
+    Mutant(
+        "k counts from 1",
+        "solvers/biasing.py",
+        "            k = state.k\n",
+        "            k = state.k + 1\n",
+        "test_solvers.py::test_authors_mazes",
+    ),
+    Mutant(
+        "KL is to the old dynamics, not to the target",
+        "solvers/biasing.py",
+        "            kl = _kl_to(problem, at, tilted)\n",
+        "            pass\n",
+        "test_solvers.py::test_target_dynamics_are_what_is_solved",
+    ),
+    Mutant(
+        "the prior is left out of the backup",
+        "solvers/problem.py",
+        "np.log1p((prior * np.expm1(gap)).sum(1)) / beta",
+        "np.log1p(np.expm1(gap).mean(1)) / beta",
+        "test_certificates.py::test_the_gap_is_of_the_policy_whatever_proved_the_bounds",
+    ),
+    Mutant(
+        "bounds have no slack for rounding",
+        "solvers/problem.py",
+        "slack = 16 * np.finfo",
+        "slack = 0 * np.finfo",
+        "test_solvers.py::test_a_thousand_certificates",
+    ),
+    Mutant(
+        "states that the start never leads to count",
+        "solvers/problem.py",
+        "mask = reachable_from(state_graph(p, n_actions), mdp.start)",
+        "mask = np.ones(mdp.n_states, bool)",
+        "test_solvers.py::test_unreachable_states_keep_the_prior",
+    ),
+    Mutant(
+        "a class is open where something leads to it",
+        "chains.py",
+        "closed[label[origin[leaves]]] = False",
+        "closed[label[chain.indices[leaves]]] = False",
+        "test_solvers.py::test_regeneration_needs_a_state_that_is_reached",
+    ),
+    Mutant(
+        "Poisson's gain misses the way back",
+        "chains.py",
+        "gain = (c[self.ref] + self._row @ x) / (1.0 + self._row @ self.hitting_time)",
+        "gain = (c[self.ref] + self._row @ x) / (self._row @ self.hitting_time)",
+        "test_solvers.py::test_regeneration_solves_the_poisson_equation",
+    ),
+    Mutant(
+        "KL the other way round",
+        "evaluation.py",
+        "policy * np.log(policy / prior)",
+        "policy * np.log(prior / policy)",
+        "test_evaluation.py::test_kl",
+    ),
+    Mutant(
+        "KL times beta",
+        "evaluation.py",
+        "return float(d[used] @ (chain.reward - kl_per_state(policy, prior) / beta)[used])",
+        "return float(d[used] @ (chain.reward - kl_per_state(policy, prior) * beta)[used])",
+        "test_evaluation.py::test_cliff_oracles",
+    ),
+    Mutant(
+        "what flows in from transient states is lost",
+        "evaluation.py",
+        "inflow = inflow + chain[transient].T @ np.atleast_1d(visits)",
+        "inflow = inflow + 0 * visits.sum()",
+        "test_evaluation.py::test_stationary_distribution_of_hard_chains",
+    ),
+    Mutant(
+        "a distribution over a horizon begins a step late",
+        "evaluation.py",
+        "share, now = share + now, backward @ now",
+        "share, now = share + backward @ now, backward @ now",
+        "test_solvers.py::test_finite_horizon_distribution",
+    ),
 ]
 
 
@@ -879,11 +1019,13 @@ class Workplace:
         if mutant.file == "kernels.py":
             cache = self.spoilt
             shutil.rmtree(cache, ignore_errors=True)
+        times = path.stat()
         path.write_text(text.replace(mutant.old, mutant.new))
         try:
             code, said = self.test(mutant.nodes, cache, LIMIT)
         finally:
-            shutil.copy2(ROOT / "erl_torch" / mutant.file, path)
+            path.write_text(text)
+            os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))
         failed = re.findall(r"^(?:FAILED|ERROR) tests/(\S+)", said, re.M)
         if code is None:
             return "killed by time"

@@ -41,6 +41,28 @@ def biasing_iterations(p, r, prior, beta, n):
     return iterates
 
 
+def backup(p, r, prior, beta, v):
+    """(TV [S], pi_V [S, A]) of the soft Bellman backup. p [S, A, S], r and prior [S, A]."""
+    q = r + p @ v
+    weight = np.log(prior) + beta * q
+    top = weight.max(1, keepdims=True)
+    total = np.exp(weight - top).sum(1, keepdims=True)
+    return (top + np.log(total))[:, 0] / beta, np.exp(weight - top) / total
+
+
+def stationary(chain):
+    """Stationary distribution of a chain [S, S] with one closed class, by least squares."""
+    n = len(chain)
+    return np.linalg.lstsq(np.vstack([chain.T - np.eye(n), np.ones(n)]), np.eye(n + 1)[n], rcond=None)[0]
+
+
+def worth(p, r, prior, beta, policy):
+    """J(policy): reward rate less KL to the prior over beta, where the policy's chain has one closed class."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        kl = np.where(policy > 0, policy * np.log(policy / prior), 0.0).sum(1)
+    return stationary(np.einsum("sa,sat->st", policy, p)) @ ((policy * r).sum(1) - kl / beta)
+
+
 class Lines9To11(NamedTuple):
     """What lines 9-11 make of a stream in iteration 0, where psi = 1 and there is no bias."""
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import hypothesis
 import numpy as np
+import oracle
 import pytest
 import torch
 from conftest import overshooting, problems, random_mdp, random_policy
@@ -356,9 +357,14 @@ def test_judge_has_the_exact_figures(problem, zeros):
     policy = random_policy(rng, *prior.shape)
     if zeros:
         policy[0] = np.eye(prior.shape[1])[0]
-    judge = Judge(mdp, prior, 50)
-    assert judge.reward_per_step(policy) == pytest.approx(reward_per_step(mdp, policy, 50), abs=1e-12)
-    assert judge.objective(policy, 2.0) == pytest.approx(objective(mdp, policy, prior, 2.0), abs=1e-12)
+    judge, p = Judge(mdp, prior, 50), mdp.transition.toarray().reshape(*prior.shape, -1)
+    chain, reward = np.einsum("sa,sat->st", policy, p), (policy * mdp.reward).sum(1)
+    rate = sum(mdp.start @ np.linalg.matrix_power(chain, t) @ reward for t in range(50)) / 50
+    j = oracle.worth(p, mdp.reward, prior, 2.0, policy)
+    for found in (judge.reward_per_step(policy), reward_per_step(mdp, policy, 50)):
+        assert found == pytest.approx(rate, abs=1e-12)
+    for found in (judge.objective(policy, 2.0), objective(mdp, policy, prior, 2.0)):
+        assert found == pytest.approx(j, abs=1e-11)
 
 
 def test_gth_is_used_only_where_it_holds():
