@@ -449,7 +449,7 @@ MUTANTS = [
         "learners/algorithm_s1.py",
         "return u, 1 / (prior * u).sum(-1)",
         "return u, u.shape[-1] / u.sum(-1)",
-        "test_algorithm_s1.py::test_converges_to_the_exact_biasing_iterations",
+        "test_algorithm_s1.py::test_psi_and_policy_are_equations_7_and_12",
     ),
     Mutant(
         "pairs without visits get the mean without its mass",
@@ -511,15 +511,15 @@ MUTANTS = [
     Mutant(
         "a lane's rewards stay in the table where its tuples have them",
         "learners/s1_lanes.py",
-        "                rewards[:, [not s.noisy for s in inside]] = 0.0  # in their tables\n",
-        "",
+        "rewards[:, [not s.noisy for s in inside]] = 0.0",
+        "pass",
         "test_replicas.py::test_bits_of_replicas_are_those_of_single_runs",
     ),
     Mutant(
-        "a lane that failed goes on",
+        "a lane that failed keeps its spoilt tables",
         "learners/s1_lanes.py",
-        "            good[list(state.ended)] = False\n",
-        "",
+        "ended[r] = (before.replica(r), self._failure(before, r))",
+        "ended[r] = (after.replica(r), self._failure(before, r))",
         "test_replicas.py::test_a_failure_later_on_keeps_the_last_good_epoch",
     ),
     Mutant(

@@ -200,6 +200,23 @@ def test_sample_means_of_psi_are_equations_10_and_11(implementation):
     assert second.reward_bias.abs().max() < 1e-14  # one sample has no spread
 
 
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("unvisited", ["initial", "prior"])
+def test_psi_and_policy_are_equations_7_and_12(implementation, unvisited):
+    """With a prior that is not uniform, and states and pairs never visited; both count with the prior."""
+    rng = np.random.default_rng(1)
+    mdp, prior = random_mdp(rng, 4, 3), random_policy(rng, 6, 3)
+    data = random_stream(rng, mdp, 200)
+    learner = AlgorithmS1(
+        3.0, 0.1, n_epochs=2, n_bias=3, prior_policy=prior, unvisited=unvisited, implementation=implementation
+    )
+    for state in learner.iterate(data.where((data.s != 1) | (data.a != 2)), 6, 3):
+        weight = prior * state.u.numpy()
+        np.testing.assert_allclose(state.psi.numpy() * weight.sum(1), 1, rtol=1e-13)
+        np.testing.assert_allclose(state.policy, weight / weight.sum(1, keepdims=True), rtol=1e-13)
+        assert state.u.mean().item() == pytest.approx(1, rel=1e-13)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_converges_to_the_exact_biasing_iterations(seed):
     rng = np.random.default_rng(seed)
