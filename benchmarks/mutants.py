@@ -6,7 +6,7 @@ A mutant is a patch (a text that stands once in a file, and another for it) and 
 those tests pass first, without any patch. Then the tree is copied, a patch applied, its tests are run, and the file is
 put back, mutant by mutant. What is found of a mutant:
 
-    killed     a test failed, or ran past its time (a loop that does not end is noticed, too)
+    killed     a test failed, ran past its time (a loop that does not end), or crashed (memory out of bounds)
     SURVIVED   all tests passed: none looks at what the patch spoils
     BROKEN     the patched code does not compile or import, which any test would notice
     STALE      the text of the patch does not stand exactly once in the file: it wants rewriting
@@ -1029,6 +1029,8 @@ class Workplace:
         failed = re.findall(r"^(?:FAILED|ERROR) tests/(\S+)", said, re.M)
         if code is None:
             return "killed by time"
+        if code < 0:
+            return f"killed by signal {-code}"
         if code == 0:
             return "SURVIVED"
         if code != 1 or UNCOMPILED.search(said):
