@@ -314,7 +314,8 @@ def lanes_epoch(
     pair, pair_next, factor, noisy, g, z, q, lr_u, lr_rho, inv_rho_min, new, step_k, step_lane, rescale_every, failed,
     begin, end,
 ):  # fmt: skip
-    """``u_epoch`` over tuples begin..end of streams [n, lanes]; factor [end - begin, lanes] where ``noisy``.
+    """``u_epoch`` over tuples begin..end of streams, which are the rows of pair, pair_next [end - begin, lanes] and,
+    where ``noisy``, factor.
 
     z, q and failed change in place (see ``_settle``).
     """
@@ -323,8 +324,8 @@ def lanes_epoch(
         stop = min(end, t - t % rescale_every + rescale_every)
         z_before, q_before = z.copy(), q.copy()
         _lanes_rows(
-            pair[begin:], pair_next[begin:], factor, noisy, g, z, q, lr_u, lr_rho, inv_rho_min, new, step_k, step_lane,
-            t - begin, stop - begin,
+            pair, pair_next, factor, noisy, g, z, q, lr_u, lr_rho, inv_rho_min, new, step_k, step_lane, t - begin,
+            stop - begin,
         )  # fmt: skip
         _settle(z, q, z_before, q_before, failed, step_k, step_lane, stop % rescale_every == 0, t)
         t = stop
@@ -340,8 +341,7 @@ def shared_epoch(
         stop = min(end, t - t % rescale_every + rescale_every)
         z_before, q_before = z.copy(), q.copy()
         _shared_rows(
-            pair[begin:], pair_next[begin:], factor, noisy, g, z, q, lr_u, lr_rho, inv_rho_min, new, t - begin,
-            stop - begin,
+            pair, pair_next, factor, noisy, g, z, q, lr_u, lr_rho, inv_rho_min, new, t - begin, stop - begin,
         )  # fmt: skip
         _settle(z, q, z_before, q_before, failed, q.size, 1, stop % rescale_every == 0, t)
         t = stop

@@ -14,6 +14,10 @@ from erl_torch import TabularMDP, Transitions
 
 # First calls compile, so no deadline; the same examples every time.
 hypothesis.settings.register_profile("erl_torch", deadline=None, derandomize=True)
+# For benchmarks/mutants.py: a failure is all that is asked for, not its smallest example.
+hypothesis.settings.register_profile(
+    "unshrunk", deadline=None, derandomize=True, phases=(hypothesis.Phase.explicit, hypothesis.Phase.generate)
+)
 hypothesis.settings.load_profile("erl_torch")
 
 ROOT = Path(__file__).parents[1]
@@ -63,6 +67,18 @@ def random_policy(rng: np.random.Generator, n_states: int, n_actions: int) -> np
 
 def random_stream(rng: np.random.Generator, mdp: TabularMDP, n_tuples: int) -> Transitions:
     return erl_torch.collect(mdp, 1, n_tuples, int(rng.integers(2**31)))
+
+
+def overshooting(largest_reward):
+    """A stream of 2 states, 1 action, on whose last tuple line 11 leaves rho far above exp(beta largest_reward).
+
+    u(1) has grown by the self-loops of 1, u(0) has not: w/u(0) is large. One tuple pays less, so that the bound is not
+    that of just any reward.
+    """
+    s = np.array([1] * 30 + [0])
+    r = np.full(31, float(largest_reward))
+    r[3] -= 1.0
+    return Transitions(s, 0 * s, r, np.ones(31, int), 0 * s)
 
 
 @st.composite

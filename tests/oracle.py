@@ -39,3 +39,44 @@ def biasing_iterations(p, r, prior, beta, n):
         iterates.append(Iterate(psi, mean_psi, mean_log_psi, delta, rho, u, policy, theta))
         psi = 1 / (prior * u).sum(1)  # eq. (7)
     return iterates
+
+
+def backup(p, r, prior, beta, v):
+    """(TV [S], pi_V [S, A]) of the soft Bellman backup. p [S, A, S], r and prior [S, A]."""
+    q = r + p @ v
+    weight = np.log(prior) + beta * q
+    top = weight.max(1, keepdims=True)
+    total = np.exp(weight - top).sum(1, keepdims=True)
+    return (top + np.log(total))[:, 0] / beta, np.exp(weight - top) / total
+
+
+def stationary(chain):
+    """Stationary distribution of a chain [S, S] with one closed class, by least squares."""
+    n = len(chain)
+    return np.linalg.lstsq(np.vstack([chain.T - np.eye(n), np.ones(n)]), np.eye(n + 1)[n], rcond=None)[0]
+
+
+def worth(p, r, prior, beta, policy):
+    """J(policy): reward rate less KL to the prior over beta, where the policy's chain has one closed class."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        kl = np.where(policy > 0, policy * np.log(policy / prior), 0.0).sum(1)
+    return stationary(np.einsum("sa,sat->st", policy, p)) @ ((policy * r).sum(1) - kl / beta)
+
+
+class Lines9To11(NamedTuple):
+    """What lines 9-11 make of a stream in iteration 0, where psi = 1 and there is no bias."""
+
+    u: np.ndarray  # [S, A], not rescaled
+    rho: float
+    largest: float  # rho of all tuples, before it was clipped
+
+
+def lines_9_to_11(data, shape, beta, lr_u, lr_rho, rho_max=np.inf):
+    """One pass, tuple by tuple, line 11 with the u that line 10 has just written."""
+    u, rho, largest = np.ones(shape), np.exp(-beta), -np.inf
+    for s, a, r, s_next, a_next in zip(data.s, data.a, data.r, data.s_next, data.a_next, strict=True):
+        u[s, a] += lr_u * (np.exp(beta * r) * u[s_next, a_next] / rho - u[s, a])
+        rho += lr_rho * (np.exp(beta * r) * u[s_next, a_next] / u[s, a] - rho)
+        largest = max(largest, rho)
+        rho = min(rho, rho_max)
+    return Lines9To11(u, rho, largest)

@@ -6,6 +6,7 @@ import hypothesis
 import numpy as np
 import oracle
 import pytest
+import scipy.sparse as sp
 import torch
 from conftest import problems, random_stream
 from hypothesis import strategies as st
@@ -274,6 +275,16 @@ def test_one_pass_of_differential_soft_q_on_the_cliff(cliff):
     assert gap[ULearning] > 0.05
 
 
+def test_the_reference_is_the_state_visited_most():
+    rng = np.random.default_rng(0)
+    s = np.array([2] * 60 + [0] * 30 + [1] * 10)
+    data = Transitions(s, rng.integers(2, size=100), -rng.random(100), rng.integers(3, size=100), 0 * s)
+    *_, chosen = RVISoftQ(beta=2.0, n_epochs=2).iterate(data, 3, 2)
+    for reference in range(3):
+        *_, given = RVISoftQ(beta=2.0, n_epochs=2, reference=reference).iterate(data, 3, 2)
+        assert torch.equal(given.q, chosen.q) == (reference == 2)
+
+
 # -- what a learner does with gaps and bad input ---------------------------------------------------------
 
 
@@ -291,8 +302,8 @@ def test_actions_never_taken_keep_their_prior_share(learner_class):
 def test_overflow_ends_with_a_status(learner_class):
     data = Transitions([0, 0], [0, 0], [1e308, -1e308], [0, 0], [0, 0])
     found = learner_class(n_epochs=3).fit(data, 1, 1)
-    if found.status is Status.NON_FINITE:
-        assert "overflows" in found.message
+    assert found.status is Status.NON_FINITE
+    assert "overflows" in found.message
     assert torch.isfinite(found.policy).all()
     assert found.theta is None or math.isfinite(found.theta)
 
@@ -355,12 +366,10 @@ def test_learners_share_one_interface(cliff, name):
 # -- nearly reducible chains ------------------------------------------------------------------------------
 
 
-def test_gth_is_the_lu_where_both_work():
+def test_gth_and_lu_are_the_stationary_distribution():
     p = np.random.default_rng(0).dirichlet(np.ones(9), size=9)
-    import scipy.sparse as sp
-
-    expected = RegenerativeLU(sp.csr_array(p), 0).stationary()
-    np.testing.assert_allclose(kernels.gth(p.copy())[0], expected, rtol=1e-12)
+    for found in (RegenerativeLU(sp.csr_array(p), 0).stationary(), kernels.gth(p.copy())[0]):
+        np.testing.assert_allclose(found, oracle.stationary(p), rtol=1e-12)
 
 
 @pytest.mark.parametrize("leave", [1e-3, 1e-30, 1e-100])

@@ -8,7 +8,7 @@ import numpy as np
 import oracle
 import pytest
 import torch
-from conftest import problems, random_mdp, random_policy, random_stream
+from conftest import overshooting, problems, random_mdp, random_policy, random_stream
 from hypothesis import strategies as st
 
 from erl_torch import AlgorithmS1, InputError, NonFiniteError, Solution, Status, Transitions, collect, kernels
@@ -200,6 +200,23 @@ def test_sample_means_of_psi_are_equations_10_and_11(implementation):
     assert second.reward_bias.abs().max() < 1e-14  # one sample has no spread
 
 
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("unvisited", ["initial", "prior"])
+def test_psi_and_policy_are_equations_7_and_12(implementation, unvisited):
+    """With a prior that is not uniform, and states and pairs never visited; both count with the prior."""
+    rng = np.random.default_rng(1)
+    mdp, prior = random_mdp(rng, 4, 3), random_policy(rng, 6, 3)
+    data = random_stream(rng, mdp, 200)
+    learner = AlgorithmS1(
+        3.0, 0.1, n_epochs=2, n_bias=3, prior_policy=prior, unvisited=unvisited, implementation=implementation
+    )
+    for state in learner.iterate(data.where((data.s != 1) | (data.a != 2)), 6, 3):
+        weight = prior * state.u.numpy()
+        np.testing.assert_allclose(state.psi.numpy() * weight.sum(1), 1, rtol=1e-13)
+        np.testing.assert_allclose(state.policy, weight / weight.sum(1, keepdims=True), rtol=1e-13)
+        assert state.u.mean().item() == pytest.approx(1, rel=1e-13)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_converges_to_the_exact_biasing_iterations(seed):
     rng = np.random.default_rng(seed)
@@ -290,7 +307,8 @@ def test_deterministic_dynamics_need_no_bias(implementation):
     data = random_stream(rng, mdp, 3000)
     learner = AlgorithmS1(beta=4.0, lr_u=0.05, n_epochs=3, n_bias=4, psi_tol=1e-13, implementation=implementation)
     for state in learner.iterate(data, n_states, n_actions):
-        assert state.reward_bias.abs().max() < 1e-11
+        assert state.reward_bias.min() >= 0
+        assert state.reward_bias.max() < 1e-11
         b = state.psi_in_use[torch.from_numpy(target)] / state.mean_psi
         np.testing.assert_allclose(b, 1, rtol=1e-11)
 
@@ -314,6 +332,43 @@ def test_positive_rewards_are_not_clipped_at_one():
     data = random_stream(np.random.default_rng(0), mdp, 2000)
     solution = AlgorithmS1(beta=1.0, lr_u=0.5, lr_rho=0.1, n_epochs=20, n_bias=2).fit(data, 2, 1)
     assert solution.theta == pytest.approx(-2.0, abs=1e-10)
+
+
+@pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
+@pytest.mark.parametrize("largest_reward", [-0.02, 0.0, 0.2])
+def test_rho_is_clipped_at_its_bound(implementation, largest_reward):
+    """At max(1, exp(beta max r)), and not without clip_rho."""
+    data, steps = overshooting(largest_reward), dict(beta=5.0, lr_u=0.05, lr_rho=0.1)
+    bound = max(1.0, math.exp(5.0 * largest_reward))
+    learner = AlgorithmS1(n_epochs=1, n_bias=1, implementation=implementation, **steps)
+    clipped, free = (
+        oracle.lines_9_to_11(data, (2, 1), **steps, rho_max=bound),
+        oracle.lines_9_to_11(data, (2, 1), **steps),
+    )
+    assert clipped.largest > 1.05 * bound
+    assert clipped.rho == bound
+    assert learner.fit(data, 2, 1).rho == pytest.approx(bound, rel=1e-15)
+    found = replace(learner, clip_rho=False).fit(data, 2, 1)
+    assert found.rho == pytest.approx(free.rho, rel=1e-12)
+    np.testing.assert_allclose(found.u, free.u / free.u.mean(), rtol=1e-12)
+
+
+@pytest.mark.parametrize("psi", [0.01, 1.01, 100.0])
+@pytest.mark.parametrize("keep", [0.3, 0.9])
+def test_the_psi_phase_ends_by_the_larger_relative_error(psi, keep):
+    """One pair: after n epochs <psi> = psi + (1 - psi) keep^n and <log psi> = log(psi) (1 - keep^n)."""
+    n = np.arange(500)
+    x, y = psi + (1 - psi) * keep**n, math.log(psi) * (1 - keep**n)
+    error = np.maximum(np.abs(np.diff(x)) / x[:-1], np.abs(np.diff(y)) / (np.abs(y[:-1]) + 1e-10))
+    expected = int(np.argmax(error < 1e-3))
+    affine = np.array([0, 1]), np.array([0], np.int32), np.array([1 - keep])
+    mean_psi, mean_log_psi = np.ones(1), np.zeros(1)
+    learner = AlgorithmS1(psi_tol=1e-3)
+    epochs, found = learner.psi_phase(affine, np.array([keep]), np.array([psi]), mean_psi, mean_log_psi)
+    assert epochs == expected + 1
+    assert found == pytest.approx(error[expected], rel=1e-9)
+    assert mean_psi[0] == pytest.approx(x[epochs], rel=1e-12)
+    assert mean_log_psi[0] == pytest.approx(y[epochs], rel=1e-12)
 
 
 # -- documented behaviour ---------------------------------------------------------------------------------
@@ -404,6 +459,13 @@ def test_psi_limit_is_reported(authors_tuples):
     assert solution.status is Status.PSI_LIMIT
     assert solution.history["psi_epochs"].tolist() == [1, 3]
     assert solution.history["psi_error"][-1] >= 1e-4
+
+
+def test_a_psi_phase_cut_short_is_remembered(authors_tuples):
+    """The last one meets its tolerance, an earlier one did not."""
+    solution = AlgorithmS1(n_epochs=1, n_bias=8, max_psi_epochs=60).fit(authors_tuples, 15, 4)
+    assert solution.history["psi_error"][-1] < 1e-4 < solution.history["psi_error"].max()
+    assert solution.status is Status.PSI_LIMIT
 
 
 def test_million_tuple_drift_stays_in_range():

@@ -116,6 +116,14 @@ def test_several_closed_sets_the_most_visited_is_solved():
     assert found.theta == pytest.approx(3.0)
 
 
+def test_of_two_closed_sets_the_one_with_more_tuples_counts():
+    """Not the one with more states."""
+    rows = [(0, 0, -1.0, 0)] * 10 + [(1, 0, -2.0, 2), (2, 0, -4.0, 1)]
+    found = CertaintyEquivalence(1.0).fit(tuples(*rows), 3, 1)
+    assert "[0]" in found.message
+    assert found.theta == pytest.approx(1.0)
+
+
 def test_a_stream_without_cycles_is_refused():
     with pytest.raises(InputError, match="never returns"):
         CertaintyEquivalence().fit(tuples((0, 0, 0.0, 1)), 2, 1)

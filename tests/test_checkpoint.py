@@ -376,6 +376,37 @@ def test_interval(tmp_path, monkeypatch):
     assert len(list((tmp_path / "never/checkpoints").iterdir())) == 1
 
 
+def test_the_newest_checkpoint_is_read(tmp_path):
+    saved = Checkpoints(tmp_path, {}, 0.0)
+    for step in (3, 20, 100):
+        saved.offer(step, lambda: {"n": step})  # noqa: B023 (called at once)
+    assert saved.read() == {"n": 100}
+
+
+def test_a_bit_flipped_in_a_table_is_seen(tmp_path, capsys):
+    """Wherever it is: torch reads on over most."""
+    saved = Checkpoints(tmp_path, {}, 0.0)
+    saved.offer(1, lambda: {"table": np.linspace(0.0, 1.0, 1000)})
+    (path,) = (tmp_path / "checkpoints").iterdir()
+    whole = path.read_bytes()
+    for at in range(0, len(whole), 97):
+        path.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])
+        assert saved.read() is None, at
+    assert "cannot be read" in capsys.readouterr().err
+
+
+def test_settings_that_are_new_or_gone_are_refused(tmp_path):
+    Checkpoints(tmp_path, {"beta": 1.0, "prior": None}, 0.0).start()
+    Checkpoints(tmp_path, {"beta": 1.0, "prior": None, "threads": 3}, 0.0)
+    for settings, said in (
+        ({"beta": 1.0, "prior": None, "lr_u": 0.1}, r"lr_u=0.1 \(there: None\)"),
+        ({"prior": None}, r"beta=None \(there: 1.0\)"),
+        ({"beta": 2.0, "prior": None}, r"beta=2.0 \(there: 1.0\)"),
+    ):
+        with pytest.raises(InputError, match=said):
+            Checkpoints(tmp_path, settings, 0.0)
+
+
 def test_values_come_back_as_they_were():
     learner = AlgorithmS1(beta=10.0, lr_u=0.5, lr_rho=1e-3, n_epochs=2, n_bias=1)
     mdp = random_mdp(np.random.default_rng(0), 3, 2)

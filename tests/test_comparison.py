@@ -6,6 +6,7 @@ import subprocess
 import sys
 
 import numpy as np
+import oracle
 import pytest
 from conftest import ROOT, random_mdp, random_policy
 from hydra import compose, initialize_config_dir
@@ -14,7 +15,7 @@ from matplotlib.image import imread
 from erl_torch import AlgorithmS1, InputError, TabularMDP, cli, collect, config, pictures, solve_soft_bellman
 from erl_torch.comparing import run_comparison
 from erl_torch.comparison import MEASURES, compare, interquartile_mean, measure, optimum
-from erl_torch.evaluation import induced_distribution, objective
+from erl_torch.evaluation import objective
 from erl_torch.learners import LEARNERS, DifferentialSoftQ, SoftQ
 
 SMALL = ("experience.n_episodes=4", "experience.episode_length=500", "seeds=2", "n_sizes=2")
@@ -53,17 +54,19 @@ def finished(tmp_path_factory):
 @pytest.mark.parametrize("beta", [0.5, 5.0])
 def test_measures_are_their_definitions(problem, beta):
     mdp, prior = problem
-    best = optimum(mdp, beta, prior)
+    p = mdp.transition.toarray().reshape(5, 3, 5)
+    best = oracle.biasing_iterations(p, mdp.reward, prior, beta, 25)[-1]
     solution = DifferentialSoftQ(beta=beta, n_epochs=1, prior_policy=prior).fit(collect(mdp, 1, 400, 3), 5, 3)
     policy = solution.policy.numpy()
-    found = measure(mdp, best, solution, beta)
-    assert found["gap"] == pytest.approx(-best.theta - objective(mdp, policy, prior, beta), rel=1e-6, abs=1e-12)
+    found = measure(mdp, optimum(mdp, beta, prior), solution, beta)
+    assert found["gap"] == pytest.approx(-best.theta - oracle.worth(p, mdp.reward, prior, beta, policy), abs=1e-10)
     kl = (best.policy * np.log(best.policy / policy)).sum(1)
-    assert found["kl"] == pytest.approx(induced_distribution(mdp, best.policy) @ kl, rel=1e-12)
-    assert found["kl_states"] == pytest.approx(kl.mean(), rel=1e-12)
-    assert found["theta_error"] == abs(solution.theta - best.theta)
+    share = oracle.stationary(np.einsum("sa,sat->st", best.policy, p))
+    assert found["kl"] == pytest.approx(share @ kl, rel=1e-8)
+    assert found["kl_states"] == pytest.approx(kl.mean(), rel=1e-8)
+    assert found["theta_error"] == pytest.approx(abs(solution.theta - best.theta), abs=1e-9)
     assert found["n_steps"] == 400
-    exact = measure(mdp, best, solve_soft_bellman(mdp, beta, prior), beta)
+    exact = measure(mdp, optimum(mdp, beta, prior), solve_soft_bellman(mdp, beta, prior), beta)
     assert max(exact[name] for name in ("gap", "kl", "kl_states", "theta_error")) < 1e-14
 
 

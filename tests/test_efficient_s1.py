@@ -4,9 +4,10 @@ from dataclasses import fields, replace
 
 import hypothesis
 import numpy as np
+import oracle
 import pytest
 import torch
-from conftest import DATA, problems, random_stream
+from conftest import DATA, overshooting, problems, random_mdp, random_policy, random_stream
 from hypothesis import strategies as st
 
 import erl_torch
@@ -27,7 +28,7 @@ from erl_torch import (
 from erl_torch.envs.windy_cliff import WindyCliffEnv
 from erl_torch.evaluation import kl_per_state, objective
 from erl_torch.learners import listing
-from erl_torch.learners.efficient_s1 import SWITCHES
+from erl_torch.learners.efficient_s1 import SWITCHES, empirical_width
 
 CLIFF = WindyCliffEnv().mdp
 UNIFORM = np.full((15, 4), 0.25)
@@ -63,6 +64,23 @@ def test_with_every_option_off_it_is_algorithm_s1(problem, beta, lr_u, lr_psi, n
     for name in ("policy", "u", "psi"):
         torch.testing.assert_close(getattr(ours, name), getattr(paper, name), rtol=1e-9, atol=0)
     torch.testing.assert_close(ours.reward_bias, paper.reward_bias, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("log_domain", ["off", "on"])
+@pytest.mark.parametrize("largest_reward", [-0.02, 0.0, 0.2])
+def test_rho_is_clipped_at_its_bound(log_domain, largest_reward):
+    data, steps = overshooting(largest_reward), dict(beta=5.0, lr_u=0.05, lr_rho=0.1)
+    bound = max(1.0, np.exp(5.0 * largest_reward))
+    assert oracle.lines_9_to_11(data, (2, 1), **steps, rho_max=bound).largest > 1.05 * bound
+    found = EfficientS1.published(n_epochs=1, n_bias=1, log_domain=log_domain, **steps).fit(data, 2, 1)
+    assert found.rho == pytest.approx(bound, rel=1e-14)
+
+
+def test_a_psi_phase_cut_short_is_remembered(authors_tuples):
+    options = dict(n_epochs=1, n_bias=8, max_psi_epochs=60)
+    errors = AlgorithmS1(**options).fit(authors_tuples, 15, 4).history["psi_error"]
+    assert errors[-1] < 1e-4 < errors.max()
+    assert EfficientS1.published(**options).fit(authors_tuples, 15, 4).status is Status.PSI_LIMIT
 
 
 # -- the compiled loops and their twins -------------------------------------------------------------------
@@ -246,6 +264,55 @@ def test_the_certificate_bounds_the_loss_in_the_empirical_model():
     for state in EfficientS1(n_epochs=2, n_bias=6).iterate(STREAM, 15, 4):
         loss = best - objective(mdp, state.policy.numpy(), UNIFORM, 10.0)
         assert -1e-12 <= loss <= state.empirical_width
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_width_bounds_the_loss_of_any_policy(seed):
+    """At V* it is max_s KL(pi || pi*)/beta, since TV* - V* is the same in every state; anywhere it bounds g* - J."""
+    rng = np.random.default_rng(seed)
+    mdp, prior, beta = random_mdp(rng, 4, 3), random_policy(rng, 4, 3), 3.0
+    model = empirical_mdp(random_stream(rng, mdp, 4000), 4, 3)
+    assert model.visits.all()
+    p = model.transition.toarray().reshape(4, 3, 4)
+    last = oracle.biasing_iterations(p, model.reward, prior, beta, 25)[-1]
+    part = model.problem(beta, prior)
+    for sharpness in (0.0, 3.0):
+        policy = prior * np.exp(sharpness * rng.standard_normal(prior.shape))
+        policy /= policy.sum(1, keepdims=True)
+        kl, kl_prior = ((policy * np.log(policy / other)).sum(1) for other in (last.policy, prior))
+        width = empirical_width(part, np.log(last.psi), policy)
+        assert width == pytest.approx(kl.max() / beta, abs=1e-9)
+        chain = np.einsum("sa,sat->st", policy, p)
+        share = np.linalg.matrix_power(chain, 10_000)[0]
+        loss = -last.theta - share @ ((policy * model.reward).sum(1) - kl_prior / beta)
+        for spread in (0.0, 0.1, 1.0):
+            assert loss <= empirical_width(part, np.log(last.psi) + spread * rng.standard_normal(4), policy) + 1e-12
+
+
+def test_theta_is_carried_over_whatever_delta_becomes():
+    """With no step for rho, theta = -log(rho)/beta - Delta stays at its first value, 1, in every iteration."""
+    states = list(EfficientS1(lr_rho=1e-300, n_epochs=2, n_bias=6, certificate=False).iterate(STREAM, 15, 4))
+    assert max(state.reward_bias_max for state in states) > 0.1
+    np.testing.assert_allclose([state.theta for state in states], 1.0, rtol=1e-12)
+
+
+def test_line_12_takes_the_mean_of_z_over_this_iterations_visits():
+    """What the sums were before an iteration leaves no trace in it."""
+    learner = EfficientS1(n_epochs=2, n_bias=3)
+    stream, state = learner.prepare(STREAM, 15, 4), learner.init(15, 4)
+    for _ in range(2):
+        state = learner.step(state, stream)
+    assert torch.isfinite(state.log_total).all()
+    other = replace(state, log_total=state.log_total + torch.linspace(5.0, 50.0, 60).reshape(15, 4))
+    for _ in range(2):
+        state, other = learner.step(state, stream), learner.step(other, stream)
+    assert torch.equal(state.policy, other.policy)
+
+
+def test_steps_of_the_clocks():
+    steps = EfficientS1(clock_horizon=4.0, clock_floor=0.1).steps()
+    np.testing.assert_allclose(steps, [max(0.1, 4 / (4 + n)) for n in range(37)], rtol=1e-15)
+    assert EfficientS1(clocks=False, lr_u=0.3).steps().tolist() == [0.3]
 
 
 # -- never NaN --------------------------------------------------------------------------------------------

@@ -274,6 +274,12 @@ def test_wind_moves_before_the_action():
     np.testing.assert_allclose(p[0, 0], [1, 0, 0], atol=1e-12)
 
 
+def test_success_is_of_the_action_alone():
+    """Where the action fails, the agent is where the wind has left it."""
+    grid = GridWorld(("FRRG",), uniform_wind(0.0, 1.0), action_success_prob=0.25)
+    np.testing.assert_allclose(grid.mdp().transition.toarray()[2], [0, 0.75, 0.25, 0], atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -85,8 +85,8 @@ def test_kl():
 def test_sampled_agrees_with_exact():
     rng = np.random.default_rng(0)
     policy = exact_cliff(1)[0].policy
-    exact = evaluate(CLIFF, policy, 10.0, rng, 200, 1000)
-    assert exact.mean_return / 1000 == pytest.approx(exact.reward_per_step, abs=0.01)
+    means = np.array([evaluate(CLIFF, policy, 10.0, rng, 10, 1000).mean_return for _ in range(20)]) / 1000
+    assert abs(means.mean() + 1.3221561) < 3.5 * means.std(ddof=1) / np.sqrt(20) < 0.01  # as of test_cliff_oracles
     hidden = gym.make("FrozenLake-v1", is_slippery=True)
     # FrozenLake under the uniform policy reaches the goal in 1.4% of the episodes.
     sampled = evaluate(hidden, np.full((16, 4), 0.25), 10.0, rng, 3000, 100)

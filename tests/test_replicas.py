@@ -7,9 +7,10 @@ from pathlib import Path
 
 import hypothesis
 import numpy as np
+import oracle
 import pytest
 import torch
-from conftest import problems, random_mdp, random_policy
+from conftest import overshooting, problems, random_mdp, random_policy
 from hypothesis import strategies as st
 from test_board import events, undocumented
 from test_config import composed
@@ -167,6 +168,32 @@ def test_torch_operations_are_the_compiled_loop(small, self_loop):
             ours, theirs = getattr(on_torch, name), getattr(compiled, name)
             np.testing.assert_allclose(ours, theirs, rtol=1e-11, atol=1e-14)
         np.testing.assert_allclose(on_torch.theta, compiled.theta, rtol=1e-12)
+
+
+def test_rewards_that_vary_are_cut_without_a_trace(small, monkeypatch):
+    """exp(beta r) is made a piece at a time: streams longer than a piece."""
+    monkeypatch.setattr("erl_torch.learners.s1_lanes.NOISY_ROWS", 777)
+    noisy, learner = small[2], AlgorithmS1(beta=3.0, lr_u=0.02, n_epochs=1, n_bias=2)
+    for experience in (noisy, noisy[1]):
+        found = Replicas.of(learner, N).fit(experience, 6, 3)
+        for r in range(N):
+            assert_same(found[r], learner.fit(tuples_of(experience, r, None), 6, 3))
+
+
+@pytest.mark.parametrize("backend", ["compiled", "torch"])
+def test_replicas_clip_rho(backend):
+    data = [overshooting(r) for r in (-0.02, 0.0, 0.2)]
+    found = Replicas.of(AlgorithmS1(5.0, 0.05, 0.1, n_epochs=1, n_bias=1), 3, backend=backend).fit(data, 2, 1)
+    np.testing.assert_allclose(found.rho, [1.0, 1.0, np.exp(1.0)], rtol=1e-14)
+    shared = Replicas.of(AlgorithmS1(5.0, n_epochs=1, n_bias=1), lr_u=[0.05, 0.06], lr_rho=[0.1, 0.1], backend=backend)
+    np.testing.assert_allclose(shared.fit(data[2], 2, 1).rho, np.exp(1.0), rtol=1e-14)
+
+
+def test_a_psi_phase_cut_short_is_remembered(authors_tuples):
+    learner = AlgorithmS1(n_epochs=1, n_bias=8, max_psi_epochs=60)
+    found = Replicas.of(learner, lr_psi=[0.1, 1.0]).fit(authors_tuples, 15, 4)
+    assert [solution.history["psi_error"][-1] < 1e-4 for solution in found.solutions] == [True, True]
+    assert [solution.status for solution in found.solutions] == [Status.PSI_LIMIT, Status.COMPLETED]
 
 
 # -- streams -----------------------------------------------------------------------------------------------
@@ -330,9 +357,14 @@ def test_judge_has_the_exact_figures(problem, zeros):
     policy = random_policy(rng, *prior.shape)
     if zeros:
         policy[0] = np.eye(prior.shape[1])[0]
-    judge = Judge(mdp, prior, 50)
-    assert judge.reward_per_step(policy) == pytest.approx(reward_per_step(mdp, policy, 50), abs=1e-12)
-    assert judge.objective(policy, 2.0) == pytest.approx(objective(mdp, policy, prior, 2.0), abs=1e-12)
+    judge, p = Judge(mdp, prior, 50), mdp.transition.toarray().reshape(*prior.shape, -1)
+    chain, reward = np.einsum("sa,sat->st", policy, p), (policy * mdp.reward).sum(1)
+    rate = sum(mdp.start @ np.linalg.matrix_power(chain, t) @ reward for t in range(50)) / 50
+    j = oracle.worth(p, mdp.reward, prior, 2.0, policy)
+    for found in (judge.reward_per_step(policy), reward_per_step(mdp, policy, 50)):
+        assert found == pytest.approx(rate, abs=1e-12)
+    for found in (judge.objective(policy, 2.0), objective(mdp, policy, prior, 2.0)):
+        assert found == pytest.approx(j, abs=1e-11)
 
 
 def test_gth_is_used_only_where_it_holds():

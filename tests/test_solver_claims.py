@@ -1,0 +1,109 @@
+"""What the exact solvers prove, against dense oracles and closed forms, where a plain run would not show a mistake."""
+
+from dataclasses import replace
+
+import numpy as np
+import oracle
+import pytest
+import torch
+from conftest import random_mdp, random_policy
+
+from erl_torch import Status, TabularMDP, certify, iterate_biasing, solve_soft_bellman
+from erl_torch.solvers.compiled import NewtonPattern
+from erl_torch.solvers.problem import Problem
+from erl_torch.solvers.result import exact_solution
+
+
+def dense(mdp):
+    return mdp.transition.toarray().reshape(*mdp.reward.shape, -1)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_gap_is_of_the_policy_whatever_proved_the_bounds(seed):
+    """Bounds on theta* may be tight where the value in hand, and so its policy, is poor."""
+    rng = np.random.default_rng(seed)
+    mdp, prior, beta = random_mdp(rng, 4, 3), random_policy(rng, 4, 3), 5.0
+    p = dense(mdp)
+    theta = oracle.biasing_iterations(p, mdp.reward, prior, beta, 25)[-1].theta
+    value = rng.standard_normal(4)
+    backed_up, policy = oracle.backup(p, mdp.reward, prior, beta, value)
+    bounds = theta - 1e-9, theta + 1e-9
+    found = exact_solution(mdp, Problem.of(mdp, beta, prior), value, Status.STEP_LIMIT, 1, bounds, prior)
+    np.testing.assert_allclose(found.policy, policy, rtol=1e-12)
+    loss = -theta - oracle.worth(p, mdp.reward, prior, beta, policy)
+    assert loss > 1e-3
+    assert loss <= found.gap + 1e-9
+    assert found.gap <= np.ptp(backed_up - value) + 1e-8
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_certified_gap_counts_from_the_end_that_no_policy_passes(seed):
+    """g* is at most -theta_bounds[0]; with wide bounds the other end would claim less than is lost."""
+    rng = np.random.default_rng(seed)
+    mdp, prior, beta = random_mdp(rng, 5, 3), random_policy(rng, 5, 3), 20.0
+    p, policy = dense(mdp), random_policy(rng, 5, 3)
+    theta = oracle.biasing_iterations(p, mdp.reward, prior, beta, 25)[-1].theta
+    wide = solve_soft_bellman(mdp, beta, prior, max_steps=1)
+    low, high = wide.theta_bounds
+    assert low + 1e-4 < theta < high - 1e-7
+    j = oracle.worth(p, mdp.reward, prior, beta, policy)
+    found = certify(replace(wide, policy=torch.from_numpy(policy)), mdp, beta, prior, best=wide)
+    assert found.gap >= -theta - j
+    assert found.gap == pytest.approx(-low - j, abs=1e-9)
+
+
+@pytest.mark.parametrize(("seed", "sizes", "beta"), [(130, (5, 2), 20.0), (281, (5, 2), 5.0), (356, (3, 2), 1.0)])
+def test_bounds_of_biasing_iterations_are_the_best_so_far(seed, sizes, beta):
+    """What a new value proves by itself is at times less than what was proven before."""
+    rng = np.random.default_rng(seed)
+    rng.integers(3, 7), rng.integers(2, 4)
+    p = rng.dirichlet(np.full(sizes[0], (0.5, 0.1, 0.03)[seed % 3]), size=sizes) + 1e-9
+    mdp = TabularMDP(p / p.sum(-1, keepdims=True), -rng.random(sizes))
+    p, prior = dense(mdp), random_policy(rng, *sizes)
+    proven = []
+    for state in iterate_biasing(mdp, beta, prior, max_steps=6):
+        gains = oracle.backup(p, mdp.reward, prior, beta, state.value)[0] - state.value
+        proven.append((-gains.max(), -gains.min()))
+        best = max(low for low, _ in proven), min(high for _, high in proven)
+        np.testing.assert_allclose(state.theta_bounds, best, atol=1e-11)
+    assert any(high > before + 1e-3 for (_, high), (_, before) in zip(proven[1:], proven, strict=False))
+
+
+@pytest.mark.parametrize("n", [3, 8, 30])
+@pytest.mark.parametrize("back", [1e-9, 1e-12])
+def test_the_cut_is_moved_off_a_state_that_is_hardly_ever_met(n, back):
+    """A walk away from 0 that goes back with probability ``back``: cut at 0, all digits are lost.
+
+    M = diag(w) P with w = y/(P y) has the eigenvector y and the root 1, whatever y is.
+    """
+    p = np.zeros((n, n))
+    for s in range(n):
+        p[s, max(s - 1, 0)] += back
+        p[s, min(s + 1, n - 1)] += 1 - 2 * back
+        p[s, s] += back
+    log_y = np.random.default_rng(n).standard_normal(n)
+    mdp = TabularMDP(p[:, None] / p.sum(1)[:, None, None], np.zeros((n, 1)), np.eye(n)[0])
+    log_weight = log_y - np.log(dense(mdp)[:, 0] @ np.exp(log_y))
+    found = NewtonPattern.of(mdp.transition, 1).eigenvector(log_weight[:, None], 0, 1e-13, 60)
+    assert found is not None
+    h, (low, high), _ = found
+    np.testing.assert_allclose(h - h[0], log_y - log_y[0], atol=1e-11)
+    assert low <= 1e-15
+    assert high >= -1e-15
+    assert high - low < 1e-12
+
+
+def test_a_tilted_row_is_as_defined():
+    """log <exp h>, p exp(h)/<exp h> and its KL to p, also where exp(h) is beyond doubles."""
+    rng = np.random.default_rng(0)
+    p = rng.dirichlet(np.ones(5), size=(4, 2))
+    problem = Problem.of(TabularMDP(np.concatenate([p, p[:1]]), np.zeros((5, 2))), 1.0)
+    for h in (rng.standard_normal(5), 1e4 + 300 * rng.standard_normal(5)):
+        log_mean, kl, tilted = problem.tilt(h)
+        rows = problem.transition.toarray()
+        log_terms = np.log(rows) + h
+        expected = np.logaddexp.reduce(log_terms, axis=1)
+        np.testing.assert_allclose(log_mean, expected, rtol=1e-13)
+        log_tilted = log_terms - expected[:, None]
+        np.testing.assert_allclose(tilted.reshape(10, 5), np.exp(log_tilted), rtol=1e-9, atol=1e-300)
+        np.testing.assert_allclose(kl, (np.exp(log_tilted) * (log_tilted - np.log(rows))).sum(1), rtol=1e-9)
