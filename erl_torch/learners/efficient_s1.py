@@ -47,18 +47,18 @@ in a phase, while <V> and r are means over all visits and z, rho run as above on
 V += log(y)/beta, and the counts give <V> anew. Delta is left out there (it cancels): theta = -log(rho)/beta, and delta
 is not estimated.
 
-Alone, that can go astray: a rare pair whose z is far off throws rho, and phases that begin far off leave V further off.
-So every phase is certified, on the empirical model of all tuples so far. Where TV - V spans more than the width that is
-due (``OnlineState.goal``), V is taken from the counts, by damped value iteration from where it is, and z with it; rho
-is kept within min and max of TV - V. A state that is yielded has a certificate of its own: the policy is that of z, or,
-should this be wider than is due, what up to 32 sweeps more make of V, if narrower. Its ``certified`` says whether the
-width is within what is due, and ``status`` and ``message`` what is amiss if not; the bound holds either way, of the
-counts' model. Where chains mix slowly, states between two ends of phases may stay wide with policies that are good.
+Alone, that goes astray on some streams: rho stays at its clip, and V with it far off. So V is certified at the end of
+every phase, on the empirical model of all tuples so far. Where TV - V spans more than is due (``OnlineState.goal``), V
+is taken from the counts, by damped value iteration from where it is, and z with it; rho is set to the nearest value
+that the certificate allows. A state that is yielded has a certificate of its own: the policy is that of z or, where
+that is wider than is due, the one that up to 32 sweeps from V make, if narrower. ``certified`` says whether the width
+is within what is due, ``status`` and ``message`` what is amiss if not; either way it bounds the loss in the counts'
+model. Where chains mix slowly, states between two ends of phases may have a wide certificate and a good policy.
 
-Cost. A phase that ends at n tuples may read 8 n entries (s,a,s') of the counts, or make one sweep: with f =
-``phase_growth``, 8 f/(f - 1) entries a tuple on the whole, whatever the problem; in practice far fewer. A state that is
-yielded costs O(S A + distinct (s,a,s')), with up to 33 sweeps. What sweeps find for it is not carried on, so that the
-cut of the stream changes nothing.
+Cost. A phase that ends at n tuples may read 8 n entries (s,a,s') of the counts, or make one sweep, beside checking its
+V once: with f = ``phase_growth``, about 8 f/(f - 1) entries a tuple on the whole, at most; in practice far fewer. A
+state that is yielded costs O(S A + distinct (s,a,s')), with up to 33 sweeps; what they find is not carried on, so that
+the cut of the stream changes nothing.
 
 Why nothing overflows: each update is a convex combination, of logarithms where they are large; w/z <= rho/a_n since
 z contains a_n w/rho, so rho rises by at most 1/a_n a tuple; z is rescaled, which changes nothing, as the updates are
@@ -228,11 +228,11 @@ class OnlineState(EfficientState):
         return np.asarray(self.beta * part.problem.action_value(value) - np.log1p(-missing)[:, None])
 
     def goal(self, tol: float) -> float:
-        """What the certificate is to be within: 1% of the range of the mean rewards; from 1000 tuples a visited pair
+        """What the certificate is to be within: .3% of the range of the mean rewards; from 1000 tuples a visited pair
         on, a share that falls as 1/tuples, like the loss of certainty equivalence, down to ``tol``."""
         reward = self.reward[self.visits > 0]
         span = float(np.ptp(reward)) or float(np.abs(reward).max()) or 1.0
-        return span * max(tol, min(0.01, 10 * len(reward) / self.n_tuples))
+        return span * max(tol, min(0.003, 3 * len(reward) / self.n_tuples))
 
     def metrics(self) -> dict[str, float]:
         """The scalars that are logged, by their documented names (docs/logging.md)."""
