@@ -475,25 +475,31 @@ def log_gauge_epoch(
 
 @numba.njit(cache=True, error_model="numpy")
 def online_phase(
-    pair, s_next, r, beta, value, mean_value, reward, visits, fresh, log_z, log_prior, log_weight, n_actions, steps,
-    log_rho, lr_rho, log_rho_max, begin, end,
+    pair, s_next, r, beta, value, visits, fresh, reward, reward_squares, mean_value, log_z, log_prior, n_actions,
+    steps, log_rho, lr_rho, log_rho_max,
 ):  # fmt: skip
-    """Tuples begin..end of one phase of the online mode; V = ``value`` [S] is fixed, tables [n_pairs] change in place.
+    """Tuples of one phase of the online mode; V = ``value`` [S] is fixed, tables [n_pairs] change in place.
 
-    ``mean_value`` and ``reward`` are means over all ``visits``; ``fresh`` counts those of this phase.
+    ``mean_value`` and ``reward`` are means over all ``visits``, ``reward_squares`` the sum of squares about the
+    latter; ``fresh`` counts the visits of this phase. Unvisited pairs of a visited state take no part.
     Returns (log rho, log_rho_max: at least beta times the largest r so far).
     """
     n_states = value.size
+    log_weight = log_prior.copy()
     y = np.zeros(n_states)
     last = steps.size - 1
     for s in range(n_states):
-        y[s] = _log_row(log_z, log_weight, s * n_actions, n_actions)
-    for i in range(begin, end):
+        first = s * n_actions
+        if np.sum(visits[first : first + n_actions]) > 0:
+            for k in range(first, first + n_actions):
+                if visits[k] == 0:
+                    log_weight[k] = -np.inf
+        y[s] = _log_row(log_z, log_weight, first, n_actions)
+    for i in range(pair.size):
         k = pair[i]
         s = k // n_actions
         first = s * n_actions
         if visits[k] == 0:
-            # Unvisited pairs of a visited state take no part.
             if np.sum(visits[first : first + n_actions]) == 0:
                 log_weight[first : first + n_actions] = -np.inf
             log_weight[k] = log_prior[k]
@@ -502,7 +508,9 @@ def online_phase(
         step = steps[min(fresh[k], last)]
         fresh[k] += 1
         visits[k] += 1
-        reward[k] += (r[i] - reward[k]) / visits[k]
+        off = r[i] - reward[k]
+        reward[k] += off / visits[k]
+        reward_squares[k] += off * (r[i] - reward[k])
         mean_value[k] += (value[s_next[i]] - mean_value[k]) / visits[k]
         w = beta * (reward[k] + mean_value[k] - value[s]) + y[s_next[i]]
         log_z[k] = _log_blend(log_z[k], w - log_rho, step)

@@ -29,6 +29,7 @@ class Status(enum.Enum):
     REDUCIBLE = "the states that the start leads to are not one recurrent class; the message names them"
     STOPPED = "stopped by the caller before the last pass; the tables are those of the last full epoch"
     PSI_LIMIT = "the psi phase met max_psi_epochs before psi_tol: raise max_psi_epochs or lr_psi"
+    UNCERTIFIED = "the certificate is wider than asked for, as the message says; the bound holds as it stands"
     NON_FINITE = "a table left the positive finite numbers; the tables are those of the last good epoch"
 
 

@@ -22,10 +22,12 @@ def experience():
 best = erl_torch.solve_soft_bellman(mdp, BETA)
 rng = np.random.default_rng(0)
 learner = erl_torch.EfficientS1(beta=BETA)
-print(f"optimal objective {-best.theta:.5f}\n tuples seen   theta    objective of the policy")
+print(f"optimal objective {-best.theta:.5f}")
+print(" tuples seen   theta    objective of the policy    its loss in the counts' model, at most")
 for state in learner.online(experience(), mdp.n_states, mdp.n_actions):
     current = state.policy.numpy()
     if state.epoch in (1, 2, 4, 8, 16, 32, 40):
         worth = erl_torch.evaluate(mdp, current, BETA, rng, n_episodes=1)
-        print(f"{state.n_tuples:12,}{state.theta:9.4f}{worth.objective:12.5f}")
+        verdict = "" if state.certified else f"  {state.message}"
+        print(f"{state.n_tuples:12,}{state.theta:9.4f}{worth.objective:12.5f}{state.empirical_width:26.5f}{verdict}")
 print("nothing was stored but counts: tables of", current.shape)

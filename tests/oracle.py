@@ -80,3 +80,37 @@ def lines_9_to_11(data, shape, beta, lr_u, lr_rho, rho_max=np.inf):
         largest = max(largest, rho)
         rho = min(rho, rho_max)
     return Lines9To11(u, rho, largest)
+
+
+def soft_optimum(p, r, prior, beta):
+    """(g* = -theta*, its policy [S, A]) by damped value iteration, to about 1e-12. p [S, A, S], r and prior [S, A]."""
+    value = np.zeros(len(r))
+    for _ in range(200_000):
+        q = beta * (r + p @ value)
+        top = q.max(1, keepdims=True)
+        weight = prior * np.exp(q - top)
+        gain = (top[:, 0] + np.log(weight.sum(1))) / beta - value
+        if np.ptp(gain) < 1e-12:
+            break
+        value = value + 0.9 * (gain - gain[0])
+    return float((gain.min() + gain.max()) / 2), weight / weight.sum(1, keepdims=True)
+
+
+def soft_rate(p, r, prior, beta, policy):
+    """(J, V) of ``policy``: reward rate less KL(policy || prior)/beta, by one dense linear system; V(0) = 0."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        kl = np.where(policy > 0, policy * np.log(policy / prior), 0.0).sum(1)
+    system = np.eye(len(r)) - np.einsum("sa,sat->st", policy, p)
+    system[:, 0] = 1.0  # V(0) = 0 leaves its column to J
+    found = np.linalg.solve(system, (policy * r).sum(1) - kl / beta)
+    return float(found[0]), np.append(0.0, found[1:])
+
+
+def counted(data, n_states, n_actions):
+    """(p [S, A, S], mean r [S, A], n(s,a) [S, A]) of a stream; rows never visited are 0."""
+    counts, rewards = np.zeros((n_states, n_actions, n_states)), np.zeros((n_states, n_actions))
+    np.add.at(counts, (data.s, data.a, data.s_next), 1.0)
+    np.add.at(rewards, (data.s, data.a), data.r)
+    visits = counts.sum(2)
+    seen = np.maximum(visits, 1)
+    return counts / seen[..., None], rewards / seen, visits

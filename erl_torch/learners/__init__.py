@@ -16,7 +16,7 @@ from erl_torch.learners.action_value import (
 )
 from erl_torch.learners.algorithm_s1 import AlgorithmS1, ListedS1, S1State
 from erl_torch.learners.certainty_equivalence import CertaintyEquivalence, CertaintyEquivalenceState
-from erl_torch.learners.efficient_s1 import EfficientS1, EfficientState
+from erl_torch.learners.efficient_s1 import EfficientS1, EfficientState, OnlineState
 from erl_torch.learners.exact import Exact, ExactState
 from erl_torch.learners.fitting import NonFiniteError
 from erl_torch.learners.z_learning import ZLearning
@@ -72,6 +72,7 @@ __all__ = [
     "ExactState",
     "ListedS1",
     "NonFiniteError",
+    "OnlineState",
     "QLearning",
     "RVISoftQ",
     "S1State",
