@@ -88,5 +88,5 @@ def assemble(results: Results, scale: str) -> Output:
 
 ARTIFACT = Artifact(
     "figure_3", "returns of every biasing iteration in the original environments", published_units, work, assemble,
-    units_of="table_s2",
+    version=2, units_of="table_s2",
 )  # fmt: skip

@@ -60,7 +60,7 @@ LABELS = {
     "tolerance": "power iteration to 1e-10 ... 4e-2",
     "power": "5 to 50 power steps a solve",
 }
-SEEDS = 5  # samples of the settings as published
+SEEDS = 20  # samples of the model as described, for the three small tasks
 # Acrobot's runs take half a minute each, with a stronger damping four.
 ACROBOT_SCAN = (
     "damping0.75", "tolerance1e-10", "tolerance1e-4", "tolerance1e-3", "tolerance1e-2", "tolerance3e-2",
@@ -238,4 +238,4 @@ def _figure(found: dict[str, dict[str, Any]], scale: str) -> Figure:
     return figure
 
 
-ARTIFACT = Artifact("table_s2", "biasing iterations of the discretised control tasks", units, work, assemble)
+ARTIFACT = Artifact("table_s2", "biasing iterations of the discretised control tasks", units, work, assemble, version=2)
