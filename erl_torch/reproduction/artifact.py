@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 REPRODUCED = "reproduced"
 NOT_REPRODUCED = "not reproduced"
-NOTHING = "nothing to compare"
+NOTHING = "no number of the paper"
 VERDICTS = (NOTHING, REPRODUCED, NOT_REPRODUCED)
 PRINTED = "printed"  # a number in the paper's text or tables
 PICTURE = "picture"  # read off a figure of the paper
