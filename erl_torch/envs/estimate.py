@@ -33,7 +33,7 @@ from erl_torch.envs.discretise import UniformBins
 from erl_torch.files import read_npz, write_npz
 from erl_torch.mdp import TabularMDP
 
-FORMAT = 1  # of the cache; goes up whenever the same settings give another model
+FORMAT = 2  # of the cache; goes up whenever the same settings give another model, so that none is used that is old
 CHUNK = 32_000  # samples at once: they fit a core's cache, and torch starts no threads for fewer than 32,768
 ROW_BYTES = 100  # of a cell and action, with a transition or two
 MOST_SAMPLES = 1_000_000  # a row, which is the least that a chunk holds

@@ -11,24 +11,29 @@ import scipy.stats
 from matplotlib.figure import Figure
 
 REPRODUCED = "reproduced"
-IN_DISTRIBUTION = "reproduced in distribution"
 NOT_REPRODUCED = "not reproduced"
-VERDICTS = (REPRODUCED, IN_DISTRIBUTION, NOT_REPRODUCED)
-PAPER = "paper"
-ORACLE = "oracle"  # computed independently of this package, to high precision
+NOTHING = "no number of the paper"
+VERDICTS = (NOTHING, REPRODUCED, NOT_REPRODUCED)
+PRINTED = "printed"  # a number in the paper's text or tables
+PICTURE = "picture"  # read off a figure of the paper
+STATED = "stated"  # said in words
+ORACLE = "computed"  # not the paper's: computed independently of this package
+SOURCES = (PRINTED, PICTURE, STATED, ORACLE)
+LEVEL = 0.95  # that all lines held against one sample are called reproduced, if they are of the same law
 
 Units = dict[str, dict[str, Any]]  # name of a unit -> keyword arguments of ``work``, as JSON takes them
 Results = dict[str, dict[str, np.ndarray]]  # name of a unit -> what ``work`` returned, as arrays
 
 
 class Comparison(NamedTuple):
-    """One number of the paper beside ours."""
+    """One number beside ours."""
 
     quantity: str
     published: Any  # number, text, or list of numbers
     ours: Any
-    verdict: str  # one of VERDICTS
-    source: str = PAPER  # of ``published``
+    verdict: str  # REPRODUCED or NOT_REPRODUCED
+    source: str = PRINTED  # of ``published``, one of SOURCES
+    within: float | None = None  # the largest difference that counts as none
     note: str = ""
 
 
@@ -52,8 +57,8 @@ class Output:
 
     @property
     def verdict(self) -> str:
-        """The weakest of the comparisons'."""
-        return max((c.verdict for c in self.comparisons), key=VERDICTS.index, default=REPRODUCED)
+        """The weakest of the comparisons with the paper; independent computations do not count."""
+        return max((c.verdict for c in self.comparisons if c.source != ORACLE), key=VERDICTS.index, default=NOTHING)
 
 
 @dataclass(frozen=True)
@@ -84,27 +89,56 @@ class Artifact:
 
 
 def compared(
-    quantity: str, published: float, ours: float, within: float, source: str = PAPER, note: str = ""
+    quantity: str, published: float, ours: float, within: float, source: str = PRINTED, note: str = ""
 ) -> Comparison:
-    """Reproduced if ``ours`` is within ``within`` of ``published``."""
-    verdict = REPRODUCED if abs(ours - published) <= within else NOT_REPRODUCED
-    return Comparison(quantity, published, float(ours), verdict, source, note)
+    """Reproduced if ``ours`` is within ``within`` of ``published``.
 
-
-def compared_in_distribution(
-    quantity: str, published: float, ours: np.ndarray, source: str = PAPER, in_logs: bool = False
-) -> Comparison:
-    """Reproduced in distribution if ``published`` lies where one more of our replicas [n] would, with 95 %.
-
-    Student's prediction interval, of the logarithms if ``in_logs``.
+    For numbers without chance ``within`` is half a unit of the last digit given, or the error of reading.
     """
-    values = np.log(ours) if in_logs else ours
-    half = scipy.stats.t.ppf(0.975, len(ours) - 1) * values.std(ddof=1) * np.sqrt(1 + 1 / len(ours))
-    low, high = values.mean() - half, values.mean() + half
-    inside = low <= (np.log(published) if in_logs else published) <= high
-    if in_logs:
-        low, high = np.exp(low), np.exp(high)
-    note = f"{len(ours)} replicas in [{ours.min():.4g}, {ours.max():.4g}]; 95 % of more: [{low:.4g}, {high:.4g}]"
-    return Comparison(
-        quantity, published, float(ours.mean()), IN_DISTRIBUTION if inside else NOT_REPRODUCED, source, note
-    )
+    verdict = REPRODUCED if abs(ours - published) <= within else NOT_REPRODUCED
+    return Comparison(quantity, published, float(ours), verdict, source, float(within), note)
+
+
+def compared_means(
+    quantity: str,
+    published: float,
+    ours: float,
+    error: float,
+    published_error: float,
+    last_digit: float,
+    lines: int,
+    freedom: float = np.inf,
+    source: str = PRINTED,
+    note: str = "",
+) -> Comparison:
+    """A mean against a mean: reproduced if they differ by no more than LEVEL allows for the error of the difference.
+
+    Args:
+        quantity, published, source, note: as in ``Comparison``.
+        ours: our mean.
+        error, published_error: standard errors of both.
+        last_digit: half a unit of the last digit published, or the error of reading; taken as uniform.
+        lines: how many such numbers are held against our sample; the level is that of all together (Sidak).
+        freedom: degrees of freedom of the standard errors (Student's t).
+    """
+    of_difference = float(np.sqrt(error**2 + published_error**2 + last_digit**2 / 3))
+    quantile = float(scipy.stats.t.isf((1 - LEVEL ** (1 / lines)) / 2, freedom))
+    ratio = abs(ours - published) / of_difference if of_difference else np.inf
+    apart = f"{ratio:.1f} standard errors of {of_difference:.2g} apart"
+    return compared(quantity, published, ours, quantile * of_difference, source, f"{apart}; {note}" if note else apart)
+
+
+def compared_samples(
+    quantity: str, published: float, ours: np.ndarray, n_published: int, last_digit: float, lines: int,
+    source: str = PRINTED, note: str = "",
+) -> Comparison:  # fmt: skip
+    """As ``compared_means``: a mean of ``n_published`` draws against our draws [n], whose deviation stands for both.
+
+    One draw is a mean of one.
+    """
+    deviation = ours.std(ddof=1)
+    its = f"ours of {len(ours)} in [{ours.min():.4g}, {ours.max():.4g}], published taken as of {n_published}"
+    return compared_means(
+        quantity, published, ours.mean(), deviation / np.sqrt(len(ours)), deviation / np.sqrt(n_published), last_digit,
+        lines, len(ours) - 1, source, f"{its}; {note}" if note else its,
+    )  # fmt: skip

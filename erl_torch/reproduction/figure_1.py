@@ -17,6 +17,7 @@ from erl_torch.reproduction.artifact import (
     NOT_REPRODUCED,
     ORACLE,
     REPRODUCED,
+    STATED,
     Artifact,
     Comparison,
     Output,
@@ -93,13 +94,13 @@ def assemble(results: Results, scale: str) -> Output:
     comparisons = [
         Comparison(
             "u v is the true distribution", "optimal only",
-            f"off by {gap['optimal']:.1%} (optimal), {gap['optimistic']:.1%} (optimistic)", told_apart,
+            f"off by {gap['optimal']:.1%} (optimal), {gap['optimistic']:.1%} (optimistic)", told_apart, STATED,
         ),
         compared("theta*", THETA, float(found["theta"]), 1e-9, ORACLE),
         compared("theta of the optimistic problem", OPTIMISTIC_THETA, float(found["optimistic_theta"]), 1e-7, ORACLE),
         compared("reward rate of the optimal policy", REWARD_RATE, float(found["optimal_reward_rate"]), 1e-6, ORACLE),
         *(
-            Comparison(f"stationary distribution, row {i}", BY_ROW[i], ours[i].round(4).tolist(), verdict, ORACLE)
+            Comparison(f"stationary distribution, row {i}", BY_ROW[i], ours[i].round(4).tolist(), verdict, ORACLE, 6e-5)
             for i in range(len(BY_ROW))
         ),
     ]  # fmt: skip
@@ -120,7 +121,8 @@ def assemble(results: Results, scale: str) -> Output:
     reading = [
         "Estimated: the product of the two eigenvectors of the tilted matrix, summed over actions. True: share of time "
         f"over {HORIZON} steps from S in the original dynamics.",
-        "The percentages are total variation distances.",
+        'The percentages are total variation distances; "optimal only" holds where that is below 1 % for the optimal '
+        "policy and above 10 % for the optimistic one.",
     ]
     data = {
         case: {

@@ -10,8 +10,9 @@ from matplotlib.patches import Patch
 
 from erl_torch.pictures import COLOURS
 from erl_torch.reproduction.artifact import (
-    IN_DISTRIBUTION,
     NOT_REPRODUCED,
+    REPRODUCED,
+    STATED,
     Artifact,
     Comparison,
     Output,
@@ -41,7 +42,7 @@ def _comparisons(counts: dict[Cell, np.ndarray]) -> list[Comparison]:
         return float(np.concatenate(chosen).mean())
 
     def comparison(said: str, ours: str, holds: bool) -> Comparison:
-        return Comparison(said, "stated", ours, IN_DISTRIBUTION if holds else NOT_REPRODUCED)
+        return Comparison(said, "in words", ours, REPRODUCED if holds else NOT_REPRODUCED, STATED)
 
     every = np.concatenate(list(counts.values()))
     share = np.mean((every >= MOST[0]) & (every <= MOST[1]))

@@ -43,7 +43,7 @@ from erl_torch.checks import InputError
 from erl_torch.config import check_reproduction_keys
 from erl_torch.files import read_npz, write_bytes, write_json, write_npz
 from erl_torch.reproduction import ARTIFACTS, SCALES, load
-from erl_torch.reproduction.artifact import PAPER, Artifact, Output
+from erl_torch.reproduction.artifact import ORACLE, Artifact, Output
 
 DPI = 130
 FINGERPRINT = "fingerprint"
@@ -121,7 +121,7 @@ def summary(its: Artifact, output: Output) -> str:
     """Published, ours and verdict, a line each."""
     cells = [("", "published", "ours", "verdict")]
     for c in output.comparisons:
-        mark = "" if c.source == PAPER else f" ({c.source})"
+        mark = f" (against what was {c.source} independently)" if c.source == ORACLE else ""
         cells.append((c.quantity, _cell(c.published), _cell(c.ours), c.verdict + mark))
     widths = [max(len(row[i]) for row in cells) for i in range(4)]
     lines = [f"  {a:{widths[0]}}  {b:>{widths[1]}}  {c:>{widths[2]}}  {d}" for a, b, c, d in cells]

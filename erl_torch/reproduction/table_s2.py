@@ -17,22 +17,20 @@ from matplotlib.figure import Figure
 from erl_torch.envs.control import control_task
 from erl_torch.pictures import COLOURS
 from erl_torch.reproduction.artifact import (
-    IN_DISTRIBUTION,
-    NOT_REPRODUCED,
     ORACLE,
-    REPRODUCED,
     Artifact,
     Comparison,
     Output,
     Results,
     Units,
+    compared_samples,
 )
 from erl_torch.reproduction.control import EPISODES, SAMPLES, TASKS, work
 
 PUBLISHED = {"pendulum": 28, "mountain_car": 38, "cart_pole": 29, "acrobot": 58}
 BY_SCRIPT = {"pendulum": 15, "mountain_car": 30, "cart_pole": 20, "acrobot": 35}  # of May 2022
-VARIES = 3  # solves from one sample to another: "a few"
-THETA = {"pendulum": 3.331, "mountain_car": 0.0576, "cart_pole": 0.170}
+# Mean over samples of the model, half a unit of its last digit, samples (20 where not known)
+THETA = {"pendulum": (3.338, 5e-4, 20), "mountain_car": (0.0400, 5e-5, 124), "cart_pole": (0.1660, 5e-5, 20)}
 QUICK_SAMPLES = 50
 # rule: (quantity, threshold); the first two are the scripts'.
 RULES = {
@@ -60,13 +58,13 @@ LABELS = {
     "tolerance": "power iteration to 1e-10 ... 4e-2",
     "power": "5 to 50 power steps a solve",
 }
-SEEDS = 5  # samples of the settings as published
+SEEDS = 20  # samples of the model as described, for the three small tasks
 # Acrobot's runs take half a minute each, with a stronger damping four.
 ACROBOT_SCAN = (
     "damping0.75", "tolerance1e-10", "tolerance1e-4", "tolerance1e-3", "tolerance1e-2", "tolerance3e-2",
     "tolerance4e-2", "power5", "power10", "power20", "samples50",
 )  # fmt: skip
-ACROBOT_SEEDS = 2
+ACROBOT_SEEDS = 5
 
 
 def samples(scale: str) -> int:
@@ -139,27 +137,26 @@ def _fits(found: dict[str, dict[str, Any]]) -> list[tuple[int, str, list[int]]]:
 
 
 def _comparisons(task: str, variants: dict[str, dict[str, np.ndarray]]) -> Iterator[Comparison]:
+    """Of full runs: the published k is that of one sample of the model."""
     name, k = TASKS[task], PUBLISHED[task]
-    ours = solves(variants["as_published"], "max KL < 1e-6")
-    agreeing = [
-        f"{variant} ({rule})" for variant, result in variants.items() for rule in RULES if solves(result, rule) == k
-    ]
-    note = "this count: " + (", ".join(agreeing) if agreeing else "no setting of the scan")
-    yield Comparison(f"{name}, k", k, ours, REPRODUCED if ours == k else NOT_REPRODUCED, note=note)
     alike = [r for v, r in variants.items() if v == "as_published" or _kind(v) == "sample"]
-    by_power = [variants["tolerance1e-10"]] if "tolerance1e-10" in variants else []
-    counts = [solves(r, "max KL < 1e-6") for r in alike + by_power]
-    low, high = min(c for c in counts if c), max(c for c in counts if c)
-    near = low - VARIES <= BY_SCRIPT[task] <= high + VARIES
-    text = f"{low} to {high}" if low < high else low
-    verdict = IN_DISTRIBUTION if near else NOT_REPRODUCED
-    yield Comparison(f"{name}, solves by the script's rule", BY_SCRIPT[task], text, verdict, ORACLE)
+    counts = np.array([solves(r, "max KL < 1e-6") for r in alike], float)
+    if len(counts) < 2:
+        return
+    agreeing = [
+        f"{variant} ({rule})" for variant, result in variants.items() if _kind(variant) != "sample" for rule in RULES
+        if solves(result, rule) == k
+    ]  # fmt: skip
+    note = "this count at seed 0: " + (", ".join(agreeing) if agreeing else "no setting of the scan")
+    yield compared_samples(f"{name}, k", k, counts, 1, 0.0, len(TASKS), note=note)
     if task in THETA:
-        thetas = np.array([r["theta"][-1] for r in alike])
-        near = abs(thetas.mean() - THETA[task]) <= 0.1 * THETA[task]
-        note = f"{len(thetas)} samples of the model, in [{thetas.min():.4g}, {thetas.max():.4g}]"
-        verdict = IN_DISTRIBUTION if near else NOT_REPRODUCED
-        yield Comparison(f"{name}, theta", THETA[task], float(thetas.mean()), verdict, ORACLE, note)
+        yield compared_samples(
+            f"{name}, solves by the script's rule", BY_SCRIPT[task], counts, 1, 0.0, len(THETA), ORACLE
+        )
+        theta, digit, n = THETA[task]
+        yield compared_samples(
+            f"{name}, theta", theta, np.array([r["theta"][-1] for r in alike]), n, digit, len(THETA), ORACLE
+        )
 
 
 def _kind(variant: str) -> str:
@@ -178,6 +175,10 @@ def _reading(fits: list[tuple[int, str, list[int]]], found: dict[str, Any]) -> l
         "Counted are eigen-solves, the first (without bias) included; stopped at max KL(optimal dynamics || model) "
         "< 1e-6 over all (s,a), the rule of the script of May 2022. The rule on chi came with the script of June 2023.",
         "Eigenvectors are exact in every component, unless a tolerance or a number of power steps is named.",
+        f"Spread: {SEEDS} samples of the model of the small tasks; {ACROBOT_SEEDS} of Acrobot's 62,208 (s,a), whose "
+        "solves take half a minute a sample.",
+        "Tried for the published k: the stop rule and ten thresholds of it, counting from 0 or 1, a damped update, "
+        "power iteration ended at tolerances from 1e-10 to .04 or after 5 to 50 steps, 50 or 1000 samples, more seeds.",
     ]
     if by_accuracy:
         loose = [
@@ -238,4 +239,4 @@ def _figure(found: dict[str, dict[str, Any]], scale: str) -> Figure:
     return figure
 
 
-ARTIFACT = Artifact("table_s2", "biasing iterations of the discretised control tasks", units, work, assemble)
+ARTIFACT = Artifact("table_s2", "biasing iterations of the discretised control tasks", units, work, assemble, version=2)
