@@ -205,12 +205,10 @@ def collect(seed: int, first: int, end: int, tree: str, certifying: bool) -> lis
 
 
 def run(seed: int, n: int, workers: int, tree: str, certifying: bool, to: Path | None) -> list[dict[str, Any]]:
-    chunk = 100
+    chunk = 250
     records: list[dict[str, Any]] = []
     with ThreadPoolExecutor(workers) as pool:
-        parts = [
-            pool.submit(collect, seed, i, min(i + chunk, n), tree, certifying) for i in range(0, n, chunk)
-        ]
+        parts = [pool.submit(collect, seed, i, min(i + chunk, n), tree, certifying) for i in range(0, n, chunk)]
         for part in parts:
             records += part.result()
             wrong = sum(bool(r["wrong"]) for r in records)

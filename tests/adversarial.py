@@ -107,15 +107,21 @@ def reached(successors: list[set[int]], sources: list[int]) -> list[int]:
     return sorted(seen)
 
 
-def eliminate(rows: dict[int, Row], columns: dict[int, list[mpf]], keep: set[int]) -> list[tuple[int, Row, mpf]]:
-    """Censor a chain on ``keep``, in place: ``rows`` (off-diagonal entries) and ``columns`` (right-hand sides).
+class Removed(NamedTuple):
+    """A state as it was when it was censored."""
 
-    Returns what a back substitution needs: (state, its row when it was removed, the weight with which it is left).
-    """
+    state: int
+    row: Row
+    out: mpf  # the weight with which it is left
+    into: dict[int, mpf]  # weights with which it is entered, divided by that
+
+
+def eliminate(rows: dict[int, Row], columns: dict[int, list[mpf]], keep: set[int]) -> list[Removed]:
+    """Censor a chain on ``keep``, in place: ``rows`` (off-diagonal entries) and ``columns`` (right-hand sides)."""
     into: dict[int, set[int]] = {s: set() for s in rows}
     for s, row in rows.items():
         for t in row:
-            into.setdefault(t, set()).add(s)
+            into[t].add(s)
     removed = []
     left = set(rows) - keep
     while left:
@@ -126,26 +132,36 @@ def eliminate(rows: dict[int, Row], columns: dict[int, list[mpf]], keep: set[int
         right = columns[k]
         for t in row:
             into[t].discard(k)
+        entered = {}
         for i in into.pop(k):
             other = rows[i]
-            share = other.pop(k) / out
+            entered[i] = share = other.pop(k) / out
             for t, p in row.items():
                 if t != i:
                     other[t] = other[t] + share * p if t in other else share * p
                     into[t].add(i)
             columns[i] = [x + share * y for x, y in zip(columns[i], right, strict=True)]
-        removed.append((k, row, out))
+        removed.append(Removed(k, row, out, entered))
     return removed
 
 
 def relative_value(rows: dict[int, Row], reward: dict[int, mpf]) -> tuple[mpf, dict[int, mpf]]:
-    """(g, h) with h + g = reward + K h and h = 0 somewhere, for an irreducible chain of off-diagonal entries."""
+    """(g, h) with h + g = reward + K h, for an irreducible chain of off-diagonal entries; h = 0 where it is most often:
+    the values of rare states, seen from there, take no more digits than they have."""
     home = min(rows)
-    columns = {s: [reward[s], mpf(1)] for s in rows}
-    removed = eliminate({s: dict(row) for s, row in rows.items()}, columns, {home})
+    while True:
+        columns = {s: [reward[s], mpf(1)] for s in rows}
+        removed = eliminate({s: dict(row) for s, row in rows.items()}, columns, {home})
+        often = {home: mpf(1)}
+        for k, _, _, into in reversed(removed):
+            often[k] = mp.fsum(often[i] * share for i, share in into.items())
+        most = max(often, key=lambda s: often[s])
+        if often[most] <= 2:
+            break
+        home = most
     g = columns[home][0] / columns[home][1]
     h = {home: mpf(0)}
-    for k, row, out in reversed(removed):
+    for k, row, out, _ in reversed(removed):
         h[k] = (columns[k][0] - g * columns[k][1] + mp.fsum(p * h[t] for t, p in row.items())) / out
     return g, h
 
@@ -155,7 +171,7 @@ def ended_in(rows: dict[int, Row], ends: dict[int, mpf]) -> dict[int, mpf]:
     columns: dict[int, list[mpf]] = {s: [] for s in [*rows, *ends]}
     removed = eliminate({**{s: dict(row) for s, row in rows.items()}, **{s: {} for s in ends}}, columns, set(ends))
     x = dict(ends)
-    for k, row, out in reversed(removed):
+    for k, row, out, _ in reversed(removed):
         x[k] = mp.fsum(p * x[t] for t, p in row.items()) / out
     return x
 
@@ -293,13 +309,11 @@ class Oracle:
             policy[s] = {a: x / total for a, x in weight.items()}
         return gain, policy
 
-    def _component(
-        self, inside: list[int], actions: list[list[int]], begin: np.ndarray | None
-    ) -> tuple[mpf, mpf, mpf]:
+    def _component(self, inside: list[int], actions: list[list[int]], begin: np.ndarray | None) -> tuple[mpf, mpf, mpf]:
         """(low, high, mean |r| met) of an end component."""
         for digits in DIGITS:
             self._at(digits)
-            for at in (begin, None):
+            for at in (begin, None) if begin is not None else (None,):
                 if at is None:
                     value = {s: mpf(0) for s in inside}
                     sizes = [abs(self.reward[s][a]) for s in inside for a in actions[s]]
