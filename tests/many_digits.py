@@ -350,7 +350,7 @@ class Oracle:
             if width <= sharp * max(abs(low), abs(high)):
                 return value, low, high, relative_value(rows, size)[0]
             widths.append(width)
-            if len(widths) > 8 and min(widths[-8:]) > min(widths[:-8]) / 2 or len(widths) > 80:
+            if len(widths) > 80 or (len(widths) > 8 and min(widths[-8:]) > min(widths[:-8]) / 2):
                 return None
             step = relative_value(rows, gain)[1]
             if max(abs(x) for x in step.values()) > mpf(10) ** 2000:  # a policy that all but never leaves a bad set
@@ -484,7 +484,7 @@ def stay_or_go(rng: np.random.Generator) -> Given:
 
 def periodic(rng: np.random.Generator) -> Given:
     given = _plain(rng, max(2, _size(rng)))
-    n, a = given.reward.shape
+    n = len(given.reward)
     period = int(rng.integers(2, n + 1))
     phase = np.arange(n) % period
     p = given.transition * (phase[None, None] == (phase[:, None, None] + 1) % period)
