@@ -34,21 +34,32 @@ import torch  # noqa: E402
 from many_digits import KINDS, Given, NoRateError, Oracle, Rate, policies, problem  # noqa: E402
 from mpmath import mp, mpf  # noqa: E402
 
-from erl_torch import InputError, TabularMDP, certify, solve_biasing, solve_soft_bellman  # noqa: E402
+from erl_torch import (  # noqa: E402
+    InputError,
+    TabularMDP,
+    certificates,
+    certify,
+    evaluation,
+    solve_biasing,
+    solve_soft_bellman,
+)
 
 # Biasing iterations that converge have done so by then; 200 of those that do not take seconds.
 SOLVERS = {"soft policy iteration": solve_soft_bellman, "biasing": partial(solve_biasing, max_steps=50)}
 TOL = 1e-10  # of the solvers, by default
 ORACLE_SECONDS = 60
-SILENT_SECONDS = 180  # a process that says nothing for so long is ended
 
 
 class TooLongError(ArithmeticError):
     """The oracle took longer than it may."""
 
 
+def _too_long(*_: Any) -> None:
+    raise TooLongError(f"more than {ORACLE_SECONDS} s")
+
+
 def examine(given: Given, seed: int, certifying: bool = True) -> dict[str, Any]:
-    """Statuses, seconds and violations of one problem."""
+    """Statuses, seconds and violations of one problem; ``certifying``: gaps and objectives too."""
     warnings.simplefilter("ignore")
     out: dict[str, Any] = {"kind": given.kind, "size": list(given.reward.shape), "wrong": []}
     oracle = Oracle(given)
@@ -71,14 +82,16 @@ def examine(given: Given, seed: int, certifying: bool = True) -> dict[str, Any]:
             _wrong(out, name, f"raised {type(error).__name__}: {error}", traceback.format_exc())
     out["seconds"] = time.process_time() - tick
     tick = time.process_time()
+    handler = signal.signal(signal.SIGALRM, _too_long)
+    signal.alarm(ORACLE_SECONDS)
     try:
-        signal.alarm(ORACLE_SECONDS)
         value = next((s.value.numpy() for s in found.values() if s.status.name == "CONVERGED"), None)
         rate = oracle.rate(value)
     except (NoRateError, TooLongError) as error:
         return out | {"no_oracle": repr(error)}
     finally:
         signal.alarm(0)
+        signal.signal(signal.SIGALRM, handler)
     out["oracle_seconds"] = time.process_time() - tick
     for name, solution in found.items():
         check_solution(out, name, solution, rate)
@@ -132,8 +145,6 @@ def check_gap(out: dict[str, Any], where: str, solution: Any, rate: Rate, worth:
 
 def certified(out: dict[str, Any], oracle: Oracle, mdp: TabularMDP, rate: Rate, best: Any, seed: int) -> None:
     """``certify`` and the routes to the objective, for policies that are not the solver's."""
-    from erl_torch import certificates, evaluation
-
     given = oracle.given
     total = given.prior.astype(float)
     total /= total.sum(1, keepdims=True)
@@ -168,10 +179,6 @@ def certified(out: dict[str, Any], oracle: Oracle, mdp: TabularMDP, rate: Rate, 
 def work(seed: int, first: int, end: int, certifying: bool) -> None:
     """Examine problems [first, end): a line before each, and a line of JSON after."""
 
-    def too_long(*_: Any) -> None:
-        raise TooLongError(f"more than {ORACLE_SECONDS} s")
-
-    signal.signal(signal.SIGALRM, too_long)
     torch.set_num_threads(1)
     for number in range(first, end):
         print(number, flush=True)
@@ -254,15 +261,16 @@ def page(table: dict[str, dict[str, Any]], records: list[dict[str, Any]], comman
         "",
         f"    {command}",
         "",
-        f"{total:,} problems of `tests/many_digits.py` (1 to 60 states, 1 to 4 actions), each with both solvers (biasing:",
-        "at most 50 iterations) and `certify` of a random, a greedy and a stay-put policy, held against an oracle of 50 to",
-        "950 digits. A violation is any of: bounds that leave out theta*, a gap below the true loss, an objective outside",
-        "its bounds, CONVERGED with theta further off than the tolerance, NaN, an exception, a process that dies.",
-        "*No oracle*: its bounds did not meet in the digits or the time that it has; all that is checked there is that",
-        "nothing is raised.",
+        f"{total:,} problems of `tests/many_digits.py` (1 to 60 states, 1 to 4 actions), each with both solvers",
+        "(biasing: at most 50 iterations) and `certify` of a random, a greedy and a stay-put policy, held against an",
+        "oracle of 50 to 950 digits. A violation is any of: bounds that leave out theta*, a gap below the true loss, an",
+        "objective outside its bounds, CONVERGED with theta further off than the tolerance, NaN, an exception, a process",
+        "that dies. *No oracle*: its bounds did not meet in the digits or the time that it has; there, all that is",
+        "checked is that nothing is raised.",
         "",
-        "Share CONVERGED: of all problems of the kind. *Before*: the package before its bounds were theorems of floating",
-        f"point too, on the first {n_before:,}, less those whose theta or bounds were wrong (how many, in brackets).",
+        "Share CONVERGED: of all problems of the kind. *Before*: the package before its bounds were theorems of",
+        f"floating point too, on the first {n_before:,}, less those whose theta or bounds were wrong (how many, in",
+        "brackets).",
         "",
         "| kind | problems | violations | died | no oracle | soft policy iteration | before | biasing | before |",
         "|---|---|---|---|---|---|---|---|---|",
@@ -306,7 +314,6 @@ def main(arguments: list[str]) -> None:
     given = dict(argument.split("=", 1) for argument in arguments)
     seed = int(given.get("seed", 0))
     if "one" in given:
-        signal.signal(signal.SIGALRM, signal.SIG_DFL)
         print(json.dumps(examine(problem(seed, int(given["one"])), seed), indent=2))
         return
     n, workers = int(given.get("n", 10_000)), int(given.get("workers", 1))

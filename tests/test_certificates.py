@@ -5,6 +5,7 @@ runs ten thousand.
 """
 
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +13,13 @@ import pytest
 from many_digits import KINDS, Given, Oracle, problem
 from mpmath import mp, mpf
 
+from erl_torch import solve_biasing
+
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
-from adversarial import examine
+import adversarial
 
-EACH = 14  # problems of a kind
+EACH = 12  # problems of a kind
 
 
 @pytest.fixture(autouse=True)
@@ -26,11 +29,13 @@ def digits():
 
 
 @pytest.mark.parametrize("kind", range(len(KINDS)), ids=lambda kind: KINDS[kind].__name__)
-def test_nothing_that_is_called_proven_is_wrong(kind):
+def test_nothing_that_is_called_proven_is_wrong(kind, monkeypatch):
     """Both solvers, ``certify`` of a random, a greedy and a stay-put policy, and three routes to the objective."""
+    # Iterations that lead nowhere take seconds.
+    monkeypatch.setitem(adversarial.SOLVERS, "biasing", partial(solve_biasing, max_steps=8))
     checked = 0
     for number in range(kind, EACH * len(KINDS), len(KINDS)):
-        found = examine(problem(1, number), 1)
+        found = adversarial.examine(problem(1, number), 1)
         assert found["wrong"] == [], f"python benchmarks/adversarial.py seed=1 one={number}"
         assert "refused" not in found
         checked += "no_oracle" not in found
