@@ -193,7 +193,7 @@ def of_model(
     return [
         Reservation(
             "data contradict the model",
-            f"the data contradict the model: {'; '.join(said)}. What is proven is of the model, not of the data's world",
+            f"the data contradict the model: {'; '.join(said)}. What is proven is of the model alone",
         )
     ]
 
@@ -256,9 +256,9 @@ def _rewards(counted: Counted, mdp: TabularMDP) -> Iterator[str]:
 def _covered(found: Tally, mdp: TabularMDP) -> bool:
     """Whether every action is tried in every state met, and no state that these lead to is missing: theta is theirs."""
     tried = found.visits.reshape(mdp.n_states, mdp.n_actions) > 0
-    inside = tried.any(1)
+    inside: np.ndarray = np.asarray(tried.any(1))
     p = mdp.transition
-    entry = np.repeat(np.repeat(inside, mdp.n_actions), np.diff(p.indptr))
+    entry: np.ndarray = np.repeat(np.repeat(inside, mdp.n_actions), np.diff(p.indptr))
     return bool(tried[inside].all() and inside[p.indices[entry]].all())
 
 
