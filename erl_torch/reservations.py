@@ -149,9 +149,9 @@ def divergence(counts: np.ndarray, row: np.ndarray, p: np.ndarray, n_rows: int) 
 
 def unlikely(total: float, freedom: int) -> bool:
     """Whether draws from p reach ``total`` with a chance below ``LEVEL``, by the bound above."""
-    if not total > freedom:
+    if not total > freedom > 0:
         return False
-    return bool(total - freedom - (freedom * np.log(total / freedom) if freedom else 0.0) > -np.log(LEVEL))
+    return bool(total - freedom - freedom * np.log(total / freedom) > -np.log(LEVEL))
 
 
 def of_actions(counts: np.ndarray, prior: np.ndarray, name: str) -> list[Reservation]:

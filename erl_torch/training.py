@@ -369,7 +369,7 @@ class _Learning:
         if self.sizes[0] > SMALL or model is None:
             return None
         # Streams that return nowhere, and chains that fall apart in double precision, have no such figure.
-        with contextlib.suppress(InputError, SingularChainError):
+        with contextlib.suppress(InputError, SingularChainError, np.linalg.LinAlgError):
             return theta_uncertainty(model, self.learner.beta, prior)
         return None
 
