@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from erl_torch.learners.replicas import Replicas, ReplicaSolution, Simulation
     from erl_torch.mdp import TabularMDP
     from erl_torch.models import MeanRewardWarning, tabular_mdp
+    from erl_torch.notes import Note
     from erl_torch.recordings import FileRecording, open_recording, save_columns
     from erl_torch.solution import Solution, Status
     from erl_torch.solvers import certify, iterate_biasing, perron, solve_biasing, solve_soft_bellman
@@ -47,6 +48,7 @@ _HOME = {
     "ListedS1": "learners.algorithm_s1",
     "MeanRewardWarning": "models",
     "NonFiniteError": "learners.fitting",
+    "Note": "notes",
     "ReplicaSolution": "learners.replicas",
     "Replicas": "learners.replicas",
     "S1State": "learners.algorithm_s1",
@@ -88,6 +90,7 @@ __all__ = [
     "ListedS1",
     "MeanRewardWarning",
     "NonFiniteError",
+    "Note",
     "Recording",
     "ReplicaSolution",
     "Replicas",

@@ -23,6 +23,7 @@ from erl_torch.config import check_comparison_keys
 from erl_torch.files import read_npy, write_json, write_png
 from erl_torch.learners import LEARNERS
 from erl_torch.mdp import TabularMDP
+from erl_torch.notes import collected
 from erl_torch.training import make_env, make_learner, make_world
 
 FIT_BYTES = 500  # of the figures of one fit
@@ -56,7 +57,7 @@ def run_comparison(cfg: DictConfig, directory: Path, safe_point: Callable[[], No
     torch.set_num_threads(1)
     if not kernels.compiled_before():
         print("compiling the loops, about ten seconds: on the first run only", file=sys.stderr)
-    with contextlib.closing(make_env(cfg.env)) as env:
+    with collected(), contextlib.closing(make_env(cfg.env)) as env:
         world = make_world(cfg.env, env, safe_point)
     # The start of the stream may be another than that of the episodes; the optimum does not depend on it.
     mdp = world.source if isinstance(world.source, TabularMDP) else world.mdp

@@ -26,7 +26,7 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
-from erl_torch import checks, pictures
+from erl_torch import checks, pictures, reservations
 from erl_torch.board import Board, hyperparameters, replica_layout
 from erl_torch.checkpoint import Checkpoints, rows_of
 from erl_torch.checks import InputError
@@ -36,9 +36,11 @@ from erl_torch.files import read_npy, write_json, write_png
 from erl_torch.learners import Exact, NonFiniteError
 from erl_torch.learners.fitting import columns
 from erl_torch.learners.replicas import KEEP_BYTES, TUPLE_BYTES, Experience, Replicas, ReplicaSolution, Simulation
-from erl_torch.mdp import TabularMDP
+from erl_torch.mdp import TabularMDP, check_policy
 from erl_torch.models import known_mdp, sizes
+from erl_torch.notes import collected, note
 from erl_torch.recordings import check_target, save_columns
+from erl_torch.reservations import Counted, Reservation
 from erl_torch.rng import streams
 from erl_torch.solution import Status
 from erl_torch.solvers import solve_soft_bellman
@@ -48,11 +50,13 @@ from erl_torch.training import (
     SafePoint,
     World,
     check_sizes,
+    ended_as,
     episode_model,
     learning_bar,
     make_env,
     make_learner,
     make_world,
+    note_rows,
     recorded,
     versions,
     where,
@@ -97,8 +101,7 @@ def train_replicas(cfg: DictConfig, directory: Path, safe_point: SafePoint, save
         NonFiniteError: replicas left the finite numbers; everything is written, the others to their end.
     """
     began = time.perf_counter()
-    env = make_env(cfg.env)
-    with contextlib.closing(env):
+    with collected() as notes, contextlib.closing(make_env(cfg.env)) as env:
         world = make_world(cfg.env, env, safe_point)
         n_states, n_actions = sizes(env)
         learner = make_learner(cfg.learner, n_states, n_actions)
@@ -118,6 +121,8 @@ def train_replicas(cfg: DictConfig, directory: Path, safe_point: SafePoint, save
         n_experience = max(_lengths(experience))
         judge = _Judges(cfg, env, world, prior, [one.beta for one in learners], seeds, threads)
 
+        for line in _reservations(experience, learners, prior, judge.model):
+            note(line)
         exact = _exact(cfg, judge, groups)
         record = _Record(groups, exact)
         stream = None if isinstance(experience, Simulation) else [data.checksum() for data in _recorded(experience)]
@@ -215,6 +220,8 @@ def train_replicas(cfg: DictConfig, directory: Path, safe_point: SafePoint, save
                     board.picture(f"{name}/{k}", card, state.n_tuples)
             board.scalars({"time/tuples_per_second": done / max(learning, 1e-9)}, state.n_tuples)
             board.scalars(_final(groups, record, exact), state.n_tuples)
+            for line in reservations.of_replicas(record.outcomes(solution, judge.model is not None)):
+                note(line)
             if solution.failures:
                 board.failed()
 
@@ -246,6 +253,7 @@ def train_replicas(cfg: DictConfig, directory: Path, safe_point: SafePoint, save
         "seconds_learning": round(learning, 3),
         "seconds": round(time.perf_counter() - began, 3),
         "versions": versions(),
+        "notes": notes,
     }
     write_json(directory / "result.json", result)
     print(_summary(cfg, groups, result, directory))
@@ -369,7 +377,7 @@ class _Judges:
         self.model: TabularMDP | None = world.mdp
         if world.mdp is not None and world.mdp.transition.nnz > e.exact_up_to:
             self.model = None
-            print("note: a large model (evaluation.exact_up_to): episodes are played instead", file=sys.stderr)
+            note("a large model (evaluation.exact_up_to): episodes are played instead")
         self.episode = None if self.model is None else episode_model(env, world)
 
     def generators(self) -> list[Any]:
@@ -419,6 +427,31 @@ class _Judges:
                 found["reward_per_step"] = np.array([figures.reward_per_step for figures in played])
                 found["objective"] = np.array([figures.objective for figures in played])
         return found
+
+
+def _reservations(
+    experience: Experience, learners: list[Any], prior: np.ndarray, model: TabularMDP | None
+) -> list[str]:
+    """What the streams do not allow the learners; each stream is read once. Theta is not held against the model's."""
+    if isinstance(experience, Simulation):  # of the model itself: no pass over the tuples tells more
+        behaviour = experience.behaviour_policy
+        own = reservations.of_rewards(float(experience.mdp.reward.min()), float(experience.mdp.reward.max()))
+        if learners[0].drawn_from_prior == "a" and behaviour is not None:
+            table = check_policy("experience.behaviour_policy", behaviour, prior.shape[0], prior.shape[1])
+            draws = np.rint(experience.n_tuples * table / len(table))  # as if it were in all states alike
+            own += reservations.of_actions(draws, prior, "a")
+        return reservations.of_replicas([own] * len(learners))
+    next_actions = any(learner.drawn_from_prior == "a_next" for learner in learners)
+    streams_of = [experience] * len(learners) if isinstance(experience, Transitions) else experience
+    counted: dict[int, Counted] = {}
+    found: list[list[Reservation]] = []
+    for learner, data in zip(learners, streams_of, strict=True):
+        if id(data) not in counted:
+            counted[id(data)] = reservations.count(data, prior.shape[0], prior.shape[1], next_actions)
+        here = counted[id(data)]
+        against = [] if model is None else reservations.of_model(here, model)
+        found.append(reservations.of_stream(here, learner, prior) + against)
+    return reservations.of_replicas(found)
 
 
 def _exact(cfg: DictConfig, judges: _Judges, groups: list[Group]) -> list[dict[str, float]]:
@@ -541,6 +574,14 @@ class _Record:
             found["replicas"] = max(found["replicas"], int(inside.size))
         return found
 
+    def outcomes(self, solution: ReplicaSolution, exact: bool) -> list[list[Reservation]]:
+        """How each replica ended; ``exact``: the objectives are."""
+        rows = self.rows["objective"] if exact else [np.full(len(solution), np.nan)]
+        return [
+            reservations.of_outcome(one.status, one.message, float(learnt), float(prior))
+            for one, learnt, prior in zip(solution.solutions, rows[-1], rows[0], strict=True)
+        ]
+
     def curves(self, exact: list[dict[str, float]]) -> dict[str, list[pictures.BandLine]]:
         """For ``pictures.bands``: quantity -> a line a group."""
         shown: dict[str, list[pictures.BandLine]] = {}
@@ -636,14 +677,13 @@ def _summary(cfg: DictConfig, groups: list[Group], result: Mapping[str, Any], di
         f"{'run directory':18}{shown}",
         f"{'look at it':18}tensorboard --logdir {logs}",
     ]
-    if result["failures"]:
-        lines.append(f"{'failed':18}{len(result['failures'])} replicas (result.json names them)")
+    lines += note_rows(result)
     return "\n".join(lines)
 
 
 def _one_group(first: str, seeds: str, result: Mapping[str, Any]) -> Iterator[str]:
     (group,) = result["groups"]
-    yield f"{first}, beta {group['beta']:g}, {result['n_replicas']} replicas ({seeds}): {result['status']}"
+    yield f"{first}, beta {group['beta']:g}, {result['n_replicas']} replicas ({seeds}): {ended_as(result)}"
     yield f"{'':18}{'mean':>12}{'quartiles':>26}{'extremes':>26}{'exact':>12}"
     for name in QUANTITIES:
         found = group.get(name)
@@ -655,7 +695,7 @@ def _one_group(first: str, seeds: str, result: Mapping[str, Any]) -> Iterator[st
 
 
 def _many_groups(first: str, seeds: str, groups: list[Group], result: Mapping[str, Any]) -> Iterator[str]:
-    yield f"{first}, {len(groups)} settings, {seeds} each: {result['status']}"
+    yield f"{first}, {len(groups)} settings, {seeds} each: {ended_as(result)}"
     width = max(len(group.title) for group in groups) + 2
     yield f"{'':{width}}{'theta':>11}{'quartiles':>24}{'exact':>11}{'objective':>12}{'at most':>11}"
     shown = result["groups"] if len(groups) <= 40 else [*result["groups"][:20], None, *result["groups"][-19:]]

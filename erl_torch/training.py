@@ -11,7 +11,7 @@ import platform
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,7 +29,6 @@ from erl_torch.chains import SingularChainError
 from erl_torch.checkpoint import Checkpoints, rows_of
 from erl_torch.checks import InputError
 from erl_torch.config import check_keys
-from erl_torch.empirical import empirical_mdp, tally
 from erl_torch.envs.discretise import Discretise
 from erl_torch.envs.estimate import estimate_mdp
 from erl_torch.envs.grid_world import GridWorld
@@ -42,6 +41,7 @@ from erl_torch.mdp import TabularMDP, check_policy
 from erl_torch.models import MeanRewardWarning, absorbing, known_mdp, sizes, tabular_mdp
 from erl_torch.notes import collected, note
 from erl_torch.recordings import FileRecording, check_target, open_recording
+from erl_torch.reservations import Reservation
 from erl_torch.rng import Streams, streams
 from erl_torch.solution import Solution, Status
 from erl_torch.solvers import certify, solve_soft_bellman
@@ -94,13 +94,12 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
         if cfg[key]:
             raise InputError(key, cfg[key], "left out, or used with n_replicas > 1 or vary.KEY=[...]")
     rng = streams(cfg.seed)
-    env = make_env(cfg.env)
-    with collected() as notes, contextlib.closing(env):
+    with collected() as notes, contextlib.closing(make_env(cfg.env)) as env:
         world = make_world(cfg.env, env, safe_point)
         judge = world.mdp
         if judge is not None and judge.transition.nnz > cfg.evaluation.exact_up_to:
             judge = None
-            print("note: a large model (evaluation.exact_up_to): episodes are played instead", file=sys.stderr)
+            note("a large model (evaluation.exact_up_to): episodes are played instead")
         n_states, n_actions = sizes(env)
         learner = make_learner(cfg.learner, n_states, n_actions)
         prior = check_policy("learner.prior_policy", learner.prior_policy, n_states, n_actions)
@@ -120,11 +119,8 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
         best = run.optimum(judge, prior) if e.certify else None
         estimate = run.uncertainty(prior) if e.certify else None
         episode = episode_model(env, world)
-        for line in run.reservations(prior):
-            note(line)
-        if estimate is not None and best is not None and best.theta_bounds is not None:
-            for line in reservations.of_model(estimate.value, estimate.standard_error, best.theta_bounds):
-                note(line)
+        for _, text in run.reservations(prior, judge, estimate, None if best is None else best.theta_bounds):
+            note(text)
         found = run.check(saved.start())
         if found:
             state, first, last = (found[key] for key in ("state", "first", "last"))
@@ -207,12 +203,9 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
             else:
                 for step in (0, run.step(state)):
                     board.scalars(_optimal_tags(solution, judge, episode, horizon), step)
-            for line in reservations.of_outcome(
-                solution.status,
-                last.objective,
-                -np.inf if judge is None else first.objective,  # sampled: too noisy
-            ):
-                note(line)
+            exact = (last.objective, first.objective) if judge is not None else (np.nan, np.nan)
+            for _, text in reservations.of_outcome(solution.status, solution.message, *exact):
+                note(text)
             rate = run.step(state) / max(clock.seconds, 1e-9)
             board.scalars({f"time/{run.unit}_per_second": rate}, run.step(state))
             final = {"theta": solution.theta, "gap": solution.gap}
@@ -290,7 +283,7 @@ class _Learning:
         prior: np.ndarray,
         safe_point: SafePoint,
     ) -> None:
-        self.learner, self.name = learner, cfg.learner.name
+        self.learner = learner
         self.sizes = sizes(world.source)
         self.n_skipped = 0
         self.data: Recording
@@ -342,17 +335,21 @@ class _Learning:
         solution: Solution = self.learner.solution(state, history, failure)
         return solution
 
-    def reservations(self, prior: np.ndarray) -> list[str]:
-        """What the stream does not allow the learner."""
-        is_s1 = self.name == "s1"
-        lines = reservations.of_rewards(tally(self.data, *self.sizes), is_s1)
-        if is_s1:
-            n_states, n_actions = self.sizes
-            counts = np.zeros(n_states * n_actions, np.int64)
-            for chunk in self.data.chunks():
-                counts += np.bincount(chunk.s_next * np.int64(n_actions) + chunk.a_next, minlength=len(counts))
-            lines += reservations.of_next_actions(counts.reshape(n_states, n_actions), prior)
-        return lines
+    @functools.cached_property
+    def counted(self) -> reservations.Counted:
+        """The stream as counts."""
+        return reservations.count(self.data, *self.sizes, self.learner.drawn_from_prior == "a_next")
+
+    def reservations(
+        self,
+        prior: np.ndarray,
+        judge: TabularMDP | None,
+        estimate: Estimate | None,
+        bounds: tuple[float, float] | None,
+    ) -> list[Reservation]:
+        """What the stream does not allow the learner, and where it contradicts the model."""
+        found = reservations.of_stream(self.counted, self.learner, prior)
+        return found + ([] if judge is None else reservations.of_model(self.counted, judge, estimate, bounds))
 
     def optimum(self, judge: TabularMDP | None, prior: np.ndarray) -> Solution | None:
         """The exact answer to ``judge``, to compare with."""
@@ -368,11 +365,12 @@ class _Learning:
 
     def uncertainty(self, prior: np.ndarray) -> Estimate | None:
         """theta* with its error, as the counts of the stream alone have it; None where that is no small problem."""
-        if self.sizes[0] > SMALL:
+        model = self.counted.model
+        if self.sizes[0] > SMALL or model is None:
             return None
         # Streams that return nowhere, and chains that fall apart in double precision, have no such figure.
-        with contextlib.suppress(InputError, SingularChainError):
-            return theta_uncertainty(empirical_mdp(self.data, *self.sizes), self.learner.beta, prior)
+        with contextlib.suppress(InputError, SingularChainError, np.linalg.LinAlgError):
+            return theta_uncertainty(model, self.learner.beta, prior)
         return None
 
 
@@ -399,7 +397,8 @@ class _Solving:
             )
         self.learner, self.mdp = learner, world.mdp
 
-    def reservations(self, prior: np.ndarray) -> list[str]:
+    def reservations(self, *_: object) -> list[Reservation]:
+        """There are no data."""
         return []
 
     def check(self, found: dict[str, Any] | None) -> None:
@@ -574,9 +573,9 @@ def make_world(cfg: DictConfig, env: gym.Env[Any, Any], safe_point: SafePoint) -
                 if reading == on_end == "absorb":
                     raise error.within("env") from error
                 if reading == on_end:
-                    print(f"note: learning from env.step, for {error}", file=sys.stderr)
+                    note(f"learning from env.step, for {error}")
     for message in sorted({str(warning.message) for warning in caught}):
-        print(f"note: {message}", file=sys.stderr)
+        note(message)
     episode = models.get("absorb")
     if episode is not None and episode.reward[absorbing(episode)].any():
         episode = None  # an end that pays for ever is no end
@@ -663,7 +662,7 @@ def recorded(
     if data.n_skipped:
         total = data.n_skipped + len(data)
         said = f"; the first is {data.first_skipped}" if data.first_skipped else ""
-        print(f"note: {cfg.path}: {data.n_skipped:,} bad tuples of {total:,} left out{said}", file=sys.stderr)
+        note(f"{cfg.path}: {data.n_skipped:,} bad tuples of {total:,} left out{said}")
     return data
 
 
@@ -799,7 +798,7 @@ def _summary(
     ]
     lines = [
         "",
-        f"{cfg.env.name}, {cfg.learner.name}, beta {cfg.learner.beta:g}, seed {cfg.seed}: {result['status']}",
+        f"{cfg.env.name}, {cfg.learner.name}, beta {cfg.learner.beta:g}, seed {cfg.seed}: {ended_as(result)}",
         f"{'':18}{'prior':>12}{'learnt':>12}",
         *(f"{name:18}{before}{after}" for name, before, after in rows),
     ]
@@ -822,8 +821,16 @@ def _summary(
         f"{'run directory':18}{directory}",
         f"{'look at it':18}tensorboard --logdir {logs}",
     ]
-    lines += [f"{'note':18}{text}" for text in result["notes"]]
-    if result["status"] not in ("completed", "converged"):
-        lines.append(f"{'status':18}{Status[result['status'].upper()].value}")
-        lines += [f"{'':18}{result['message']}"] if result["message"] else []
+    lines += note_rows(result)
     return "\n".join(lines)
+
+
+def ended_as(result: Mapping[str, Any]) -> str:
+    """The status of ``result.json``, which is no success without its notes."""
+    n = len(result["notes"])
+    return f"{result['status']}, with {n} note{'s' * (n > 1)}" if n else f"{result['status']}"
+
+
+def note_rows(result: Mapping[str, Any]) -> list[str]:
+    """A row of the summary each."""
+    return [f"{'note':18}{text}" for text in result["notes"]]

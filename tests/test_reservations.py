@@ -1,22 +1,366 @@
-"""Reservations: true streams give none, and each fault its own."""
+"""Reservations: each fault has its own note, in single runs and in replicas, and true streams have none."""
+
+import itertools
+import json
+import math
+import warnings
 
 import numpy as np
+import pytest
+from conftest import random_mdp, random_policy
+from test_config import composed
 
-from erl_torch.reservations import of_model, of_next_actions, of_outcome
+import erl_torch
+from erl_torch import NonFiniteError, TabularMDP, Transitions, collect
+from erl_torch.envs.windy_cliff import WindyCliffEnv
+from erl_torch.learners import LEARNERS, EfficientS1
+from erl_torch.notes import collected, note
+from erl_torch.reservations import Reservation, count, divergence, of_actions, of_model, of_outcome, of_replicas
+from erl_torch.reservations import unlikely as is_unlikely
 from erl_torch.solution import Status
+from erl_torch.training import train
+
+SHORT = ("learner.n_epochs=2", "learner.n_bias=2", "evaluation.pictures=false")
+NOISE, FROM_PRIOR = "rewards vary for the same (s,a)", "no draws from the prior policy"
+EQUAL, WORSE, MODEL = "every reward of the stream is", "worse than the prior", "the data contradict the model"
+OF_DATA = (NOISE, FROM_PRIOR, EQUAL, MODEL)
 
 
-def test_next_actions_of_the_prior_and_of_another_policy():
-    prior = np.array([[0.5, 0.5], [0.9, 0.1]])
+def changed(data, **columns):
+    return Transitions(**{name: columns.get(name, getattr(data, name)) for name in ("s", "a", "r", "s_next", "a_next")})
+
+
+@pytest.fixture(scope="module")
+def cliff():
+    return WindyCliffEnv().mdp
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory, cliff):
+    """Paths by name: a stream of the windy cliff as it is, and with one fault each."""
     rng = np.random.default_rng(0)
-    for _ in range(200):
-        assert of_next_actions(np.stack([rng.multinomial(1000, row) for row in prior]), prior) == []
-    assert len(of_next_actions(np.array([[700, 300], [900, 100]]), prior)) == 1
-    assert of_next_actions(np.array([[4, 0], [0, 0]]), prior) == []  # too few to tell
+    data = collect(cliff, 50, 1000, 0)
+    follow = np.array([0.1, 0.1, 0.1, 0.7])
+    other = TabularMDP(np.roll(cliff.transition.toarray(), 1, axis=1), cliff.reward)
+    made = {
+        "true": data,
+        "noisy": changed(data, r=data.r + rng.standard_normal(len(data))),
+        "fuzz": changed(data, r=data.r * (1 + 1e-9 * rng.standard_normal(len(data)))),
+        "single": changed(data, r=data.r.astype(np.float32).astype(np.float64)),
+        "policy": changed(data, a_next=rng.choice(4, len(data), p=follow)),
+        "dynamics": collect(other, 50, 1000, 0),
+        "wind": collect(WindyCliffEnv(wind_strength=0.6).mdp, 500, 1000, 0),
+        "rewards": changed(data, r=np.where(data.s == 7, data.r - 0.01, data.r)),
+        "behaviour": collect(cliff, 50, 1000, 0, np.tile(follow, (15, 1))),
+    }
+    directory = tmp_path_factory.mktemp("streams")
+    return {name: stream.save(directory / f"{name}.npz") for name, stream in made.items()}
 
 
-def test_model_and_outcome():
-    assert of_model(1.0, 0.01, (1.04, 1.05)) == []
-    assert len(of_model(1.0, 0.01, (1.06, 1.07))) == len(of_model(1.0, 0.01, (0.9, 0.94))) == 1
-    assert of_outcome(Status.COMPLETED, -1.0, -1.6) == []
-    assert len(of_outcome(Status.PSI_LIMIT, -2.0, -1.6)) == 2
+def notes(tmp_path, *overrides, learner=SHORT, capsys=None):
+    """The notes of a run; each is in ``result.json``, and where ``capsys`` is given also printed and in the summary."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        result = train(composed(*overrides, *learner), tmp_path)
+    assert json.loads((tmp_path / "result.json").read_text())["notes"] == result["notes"]
+    if capsys is not None:
+        out, err = capsys.readouterr()
+        n = len(result["notes"])
+        ended = ("", ", with 1 note")[n] if n < 2 else f", with {n} notes"
+        assert f": {result['status']}{ended}\n" in out
+        for line in result["notes"]:
+            assert err.count(f"note: {line}\n") == 1
+            assert out.count(f"{'note':18}{line}\n") + out.endswith(f"{'note':18}{line}") == 1
+    return result["notes"]
+
+
+def of_stream(path):
+    return ("experience=recorded", f"experience.path={path}")
+
+
+def having(lines, *texts):
+    """Of the reservations about data, exactly these."""
+    found = [line for line in lines if any(text in line for text in OF_DATA)]
+    assert len(found) == len(texts), found
+    for text in texts:
+        assert sum(text in line for line in found) == 1, found
+    return found
+
+
+# -- end to end -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["true", "fuzz", "single"])
+def test_a_true_recording_has_no_note(tmp_path, recordings, name):
+    assert notes(tmp_path, *of_stream(recordings[name]), learner=("evaluation.pictures=false",)) == []
+
+
+@pytest.mark.parametrize(
+    ("learner", "concerned"),
+    [
+        (("learner=s1", *SHORT), True),
+        (("learner=u_learning", "learner.n_epochs=1"), True),
+        (("learner=z_learning", "learner.n_epochs=1"), True),
+        (("learner=s1_efficient", "learner.mean_reward=false", *SHORT), True),
+        (("learner=s1_efficient", *SHORT), False),
+        (("learner=differential_soft_q", "learner.n_epochs=1"), False),
+        (("learner=certainty_equivalence",), False),
+    ],
+)
+def test_noise_in_rewards(tmp_path, capsys, recordings, learner, concerned):
+    found = notes(tmp_path, *of_stream(recordings["noisy"]), learner=learner, capsys=capsys)
+    lines = having(found, *[NOISE] * concerned)
+    if concerned:  # 10 * 1 / 2, of the noisiest of 60 pairs with hundreds of visits or tens
+        size = float(lines[0].split("beta Var/2 = ")[1].split()[0])
+        assert 5 < size < 15
+
+
+def test_noise_beyond_its_expansion_is_bounded_by_the_largest_reward(cliff):
+    data = collect(cliff, 50, 1000, 0)
+    rare = changed(data, r=data.r + 3.0 * (np.random.default_rng(0).random(len(data)) < 0.1))
+    counted = count(rare, 15, 4, False)
+    (line,) = erl_torch.reservations.of_noise(counted, 100.0)
+    at = line.text.split("(s=")[1].split(")")[0]
+    s, a = map(int, at.split(", a="))
+    here = rare.r[(rare.s == s) & (rare.a == a)]
+    assert f"about {rare.r.max() - here.mean():.2g} (its largest reward" in line.text
+
+
+@pytest.mark.parametrize(
+    ("stream", "learner", "concerned"),
+    [
+        ("policy", ("learner=s1", "evaluation.pictures=false"), True),
+        ("policy", ("learner=s1_efficient", "learner.expected_backup=false", *SHORT), True),
+        ("policy", ("learner=s1_efficient", *SHORT), False),
+        ("policy", ("learner=z_learning", "learner.n_epochs=1"), False),
+        ("behaviour", ("learner=z_learning", "learner.n_epochs=1"), True),
+        ("behaviour", ("learner=s1", *SHORT), False),
+        ("behaviour", ("learner=u_learning", "learner.n_epochs=1"), False),
+    ],
+)
+def test_actions_of_another_policy(tmp_path, recordings, stream, learner, concerned):
+    found = notes(tmp_path, *of_stream(recordings[stream]), learner=learner)
+    having(found, *[FROM_PRIOR] * concerned)
+
+
+def test_theta_beside_the_proven_one_has_its_note(tmp_path, capsys, cliff):
+    """a' of another policy: theta is far from the 1.0101 proven beside it, and the summary says why."""
+    data = collect(cliff, 500, 1000, 0)
+    greedy = LEARNERS["certainty_equivalence"](beta=10.0).fit(data, 15, 4).policy.numpy()
+    cdf = np.cumsum(greedy, axis=1)
+    draws = np.random.default_rng(1).random(len(data))
+    path = changed(data, a_next=(cdf[data.s_next] < draws[:, None]).sum(1).clip(max=3)).save(tmp_path / "t.npz")
+    result = train(composed(*of_stream(path), "evaluation.pictures=false"), tmp_path / "run")
+    out = capsys.readouterr().out
+    low, high = result["theta_bounds"]
+    assert (low, high) == pytest.approx((1.0101363366,) * 2, abs=1e-8)
+    assert result["theta"] < 0.99
+    assert "completed, with 1 note\n" in out
+    having(result["notes"], FROM_PRIOR)
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("dynamics", "transitions are impossible in it, as from s="),
+        ("wind", "transition counts are no draws from its rows"),
+        ("rewards", "mean rewards of 4 of 58 pairs are others, as -1.01 for -1 at s=7, a=0"),
+    ],
+)
+@pytest.mark.parametrize("many", [False, True])
+def test_data_of_another_model(tmp_path, capsys, recordings, name, says, many):
+    vary = ["++vary.beta=[5,10]"] * many
+    (line,) = having(notes(tmp_path, *of_stream(recordings[name]), *vary, capsys=capsys), MODEL)
+    assert says in line
+    assert "What is proven is of the model alone" in line
+    assert line.startswith("2 of 2 replicas: ") == many
+
+
+def test_impossible_transitions_are_counted(recordings, cliff):
+    data = Transitions.load(recordings["dynamics"])
+    p = cliff.transition.toarray().reshape(15, 4, 15)
+    impossible = int((p[data.s, data.a, data.s_next] == 0).sum())
+    (found,) = of_model(count(data, 15, 4, False), cliff)
+    assert f"{impossible:,} of 50,000 transitions" in found.text
+    s, a, s_next = (int(found.text.split(key)[1].split()[0].strip(",")) for key in ("from s=", "a=", "to s'="))
+    assert p[s, a, s_next] == 0
+    assert f"({((data.s == s) & (data.a == a) & (data.s_next == s_next)).sum():,} times)" in found.text
+
+
+def test_mean_rewards_that_differ_among_noise(cliff):
+    """By half a standard deviation at one state; and the same noise about the model's own means says nothing."""
+    data = collect(cliff, 200, 1000, 1)
+    noise = 0.2 * np.random.default_rng(2).standard_normal(len(data))
+    assert of_model(count(changed(data, r=data.r + noise), 15, 4, False), cliff) == []
+    often = np.bincount(data.s).argmax()
+    (found,) = of_model(count(changed(data, r=data.r + noise + 0.5 * (data.s == often)), 15, 4, False), cliff)
+    assert f"at s={often}, a=" in found.text
+
+
+def test_equal_rewards(tmp_path, capsys):
+    """CartPole-v1 pays 1 a step, whatever is done."""
+    bins = ("env.bins=[3,3,6,6]", "env.low=[-2.4,-3,-0.21,-3]", "env.high=[2.4,3,0.21,3]")
+    few = ("experience.n_episodes=20", "learner=s1_efficient")
+    arguments = ("env=gym", "env.id=CartPole-v1", *bins, *few)
+    having(notes(tmp_path / "one", *arguments, capsys=capsys), EQUAL + " 1:")
+    (line,) = having(notes(tmp_path / "many", *arguments, "n_replicas=2", capsys=capsys), EQUAL + " 1:")
+    assert line.startswith("2 of 2 replicas: ")
+
+
+def test_equal_rewards_of_a_simulated_model(tmp_path, cliff):
+    TabularMDP(cliff.transition, np.full((15, 4), -2.0)).save(tmp_path / "mdp.npz")
+    arguments = ("env=mdp", f"env.path={tmp_path}/mdp.npz", "experience.n_episodes=3", "learner.lr_u=0.001")
+    one = having(notes(tmp_path / "one", *arguments), EQUAL + " -2:")
+    many = having(notes(tmp_path / "many", *arguments, "n_replicas=3"), EQUAL + " -2:")
+    assert many == [f"3 of 3 replicas: {line}" for line in one]
+
+
+def test_a_policy_worse_than_the_prior(tmp_path, capsys):
+    """Steps of .6 on few tuples; the same seeds alone say the same, and only those that are worse are counted."""
+    arguments = ("experience.n_episodes=2", "learner.lr_u=0.6", "learner.lr_rho=0.001")
+    alone = [notes(tmp_path / str(seed), *arguments, f"seed={seed}") for seed in range(3)]
+    many = notes(tmp_path / "many", *arguments, "n_replicas=3", capsys=capsys)
+    worse = [line for lines in alone for line in lines if WORSE in line]
+    assert worse, alone
+    (line,) = [line for line in many if WORSE in line]
+    assert line.startswith(f"{len(worse)} of 3 replicas: {worse[0]}")
+
+
+def test_replicas_that_left_the_numbers(tmp_path, capsys):
+    few = ("experience.n_episodes=5", "n_replicas=2", "++vary.beta=[10,600]")
+    with pytest.raises(NonFiniteError):
+        train(composed(*few, *SHORT), tmp_path)
+    out, err = capsys.readouterr()
+    (line,) = [line for line in json.loads((tmp_path / "result.json").read_text())["notes"] if "non_finite" in line]
+    assert line.startswith("2 of 4 replicas: non_finite: ")
+    assert f"note: {line}" in err
+    assert "non_finite, with " in out
+
+
+def test_what_was_a_note_already_is_kept(tmp_path):
+    few = ("experience.n_episodes=2", "evaluation.exact_up_to=1", "evaluation.n_episodes=2")
+    found = notes(tmp_path / "a", "env=frozen_lake", *few)
+    assert any("the reward depends on s'" in line for line in found)
+    assert any("a large model (evaluation.exact_up_to)" in line for line in found)
+    again = notes(tmp_path / "b", "env=frozen_lake", *few, "n_replicas=2")
+    assert any("a large model" in line for line in again)
+
+
+# -- no false alarms ------------------------------------------------------------------------------------
+
+BUILT_IN = (
+    "cart_pole", "cliff_walking", "dynamics_shift", "mountain_car", "pendulum", "taxi", "windy_cliff",
+    "windy_frozen_lake", "windy_maze",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("env", BUILT_IN)
+def test_built_in_environments(tmp_path, env):
+    """Their data have no reservation. (A policy of two passes may well be worse than the prior; FrozenLake's rewards
+    depend on s', and Acrobot's model is too large for exact figures: notes that are right.)"""
+    small = ["env.n_samples=20"] * (env in ("cart_pole", "mountain_car", "pendulum"))
+    found = notes(tmp_path, f"env={env}", "experience.n_episodes=10", "evaluation.n_episodes=2", *small)
+    assert [line for line in found if WORSE not in line] == []
+
+
+def test_thousands_of_true_streams():
+    """Short and long streams of random models and policies, against the model and the prior: none is spoken of."""
+    rng = np.random.default_rng(0)
+    for seed in range(1000):
+        n_states, n_actions = rng.integers(2, 8), rng.integers(2, 5)
+        mdp = random_mdp(rng, n_states, n_actions)
+        prior = 0.99 * random_policy(rng, n_states, n_actions) + 0.01 / n_actions
+        data = collect(mdp, 1, int(10 ** rng.uniform(0.5, 3.5)), seed, prior_policy=prior)
+        counted = count(data, n_states, n_actions, True)
+        assert of_model(counted, mdp) == []
+        assert of_actions(counted.next_actions, prior, "a'") == []
+        assert of_actions(counted.model.visits, prior, "a") == []
+
+
+# -- the bound ------------------------------------------------------------------------------------------
+
+
+def compositions(n, k):
+    return (c for c in itertools.product(range(n + 1), repeat=k) if sum(c) == n)
+
+
+@pytest.mark.parametrize("p", [(0.5, 0.5), (0.9, 0.1), (0.999, 0.001), (0.2, 0.3, 0.5), (0.98, 0.01, 0.01)])
+@pytest.mark.parametrize("n", [1, 3, 8])
+def test_bound_on_the_divergence(p, n):
+    """Agrawal's bound on the moments of n KL, behind the level, by summing over every outcome."""
+    for x in (0.3, 0.7, 0.95):
+        moment = 0.0
+        for c in compositions(n, len(p)):
+            chance = math.factorial(n) * math.prod(q**m / math.factorial(m) for q, m in zip(p, c, strict=True))
+            total = sum(m * math.log(m / (n * q)) for q, m in zip(p, c, strict=True) if m)
+            moment += chance * math.exp(x * total)
+        assert moment <= (1 - x) ** -(len(p) - 1) * (1 + 1e-12)
+
+
+def test_divergence_pools_small_cells_of_a_row():
+    p = np.array([0.5, 0.5, 0.98, 0.01, 0.01])
+    row = np.array([0, 0, 1, 1, 1])
+    counts = np.array([30, 10, 45, 5, 0])
+    total, freedom = divergence(counts, row, p, 2)
+    by_hand = 30 * np.log(30 / 20) + 10 * np.log(10 / 20) + 45 * np.log(45 / 49) + 5 * np.log(5 / 1)
+    assert total == pytest.approx(by_hand, rel=1e-12)
+    assert freedom == 2
+    assert divergence(np.array([1, 0]), row[:2], p[:2], 1) == (0.0, 0)  # all pooled: too few to tell
+
+
+def test_level():
+    """For 1 degree of freedom, e D exp(-D) = 1e-9 at D = 24.9..."""
+    below, above = 24.0, 25.0
+    assert math.e * below * math.exp(-below) > 1e-9 > math.e * above * math.exp(-above)
+    assert not is_unlikely(below, 1)
+    assert is_unlikely(above, 1)
+    assert not is_unlikely(0.5, 1)
+    assert not is_unlikely(1e-15, 0)
+
+
+def test_actions_in_states_that_are_met_a_few_times_count_together():
+    """300 states, 8 draws each, never the second action: no row tells alone, all of them do."""
+    prior = np.full((300, 2), 0.5)
+    assert of_actions(np.tile([8, 0], (1, 1)), prior[:1], "a'") == []
+    assert len(of_actions(np.tile([8, 0], (300, 1)), prior, "a'")) == 1
+
+
+# -- words --------------------------------------------------------------------------------------------------
+
+
+def test_declarations():
+    asks = {name: (one.averages_exp_reward, one.drawn_from_prior) for name, one in
+            ((n, c()) for n, c in LEARNERS.items() if n != "exact")}  # fmt: skip
+    assert {name for name, (exp, _) in asks.items() if exp} == {"s1", "u_learning", "z_learning"}
+    assert {name: column for name, (_, column) in asks.items() if column} == {"s1": "a_next", "z_learning": "a"}
+    assert EfficientS1.published().averages_exp_reward
+    assert EfficientS1.published().drawn_from_prior == "a_next"
+
+
+def test_outcome():
+    assert of_outcome(Status.COMPLETED, "", -1.0, -1.6) == []
+    assert of_outcome(Status.CONVERGED, "", -1.6, -1.6) == []
+    assert of_outcome(Status.COMPLETED, "", float("nan"), float("nan")) == []
+    ended, worse = of_outcome(Status.PSI_LIMIT, "said so", -2.0, -1.6)
+    assert ended.text.startswith("psi_limit: ")
+    assert "(said so)" in ended.text
+    assert WORSE in worse.text
+
+
+def test_replicas_say_each_kind_once():
+    same, differs = Reservation("x", "x"), [Reservation("y", "y 1"), Reservation("y", "y 2")]
+    assert of_replicas([[], []]) == []
+    assert of_replicas([[same], [same, differs[0]], [differs[1]]]) == [
+        "2 of 3 replicas: x",
+        "2 of 3 replicas: y 1 (so replica 1)",
+    ]
+
+
+def test_notes_are_warnings_of_their_own_class():
+    with pytest.warns(erl_torch.Note, match="^two lines$"):
+        note("two\n  lines")
+    with collected() as found:
+        note("a")
+        note("b")
+        note("a")
+    assert found == ["a", "b"]

@@ -1,5 +1,8 @@
 """Learners: ``fit(transitions, n_states, n_actions) -> Solution``, ``iterate(...)`` yields every epoch.
 
+What a learner asks of its stream it declares: ``averages_exp_reward`` (noise in r counts as reward) and
+``drawn_from_prior`` (the column that must be draws from the prior policy: "a", "a_next", or "").
+
 ``Exact`` solves a model instead: ``solve(mdp)``, ``iterate(mdp)``.
 """
 

@@ -123,6 +123,11 @@ class ActionValueLearner:
 
     backup: ClassVar[int] = SOFT
     exponential: ClassVar[bool] = False
+    drawn_from_prior: ClassVar[str] = ""
+
+    @property
+    def averages_exp_reward(self) -> bool:
+        return self.exponential
 
     def __post_init__(self) -> None:
         checks.temperature("beta", self.beta)

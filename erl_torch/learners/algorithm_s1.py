@@ -196,6 +196,8 @@ class AlgorithmS1:
     """
 
     stream_bytes: ClassVar[int] = 32  # a tuple in a prepared stream: columns, pairs
+    averages_exp_reward: ClassVar[bool] = True
+    drawn_from_prior: ClassVar[str] = "a_next"
 
     beta: float = 10.0
     lr_u: float = 0.005

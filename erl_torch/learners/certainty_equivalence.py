@@ -83,6 +83,8 @@ class CertaintyEquivalence:
     """
 
     stream_bytes: ClassVar[int] = 1  # a tuple in a prepared stream: counts alone
+    averages_exp_reward: ClassVar[bool] = False
+    drawn_from_prior: ClassVar[str] = ""
 
     beta: float = 10.0
     tol: float = 1e-10

@@ -332,6 +332,14 @@ class EfficientS1:
         paper: dict[str, object] = {"log_domain": "off", "unvisited": "initial", "n_epochs": 15, "n_bias": 6}
         return cls(beta, **(off | paper | options))  # type: ignore[arg-type]
 
+    @property
+    def averages_exp_reward(self) -> bool:
+        return not self.mean_reward
+
+    @property
+    def drawn_from_prior(self) -> str:
+        return "" if self.expected_backup else "a_next"
+
     # -- the whole run ------------------------------------------------------------------------------
 
     def fit(self, transitions: Recording, n_states: int, n_actions: int) -> Solution:
