@@ -40,6 +40,7 @@ import scipy.sparse as sp
 from scipy import special
 
 from erl_torch import checks
+from erl_torch.chains import SingularChainError
 from erl_torch.checks import InputError
 from erl_torch.empirical import EmpiricalMDP, EmpiricalProblem
 from erl_torch.evaluation import kl_per_state
@@ -311,7 +312,10 @@ def _second_order(
         return 0.0
     chain = problem.chain(policy)
     d = problem.regeneration(policy).stationary()
-    z = np.linalg.inv(np.eye(n_states) - chain.toarray() + d)
+    try:
+        z = np.linalg.inv(np.eye(n_states) - chain.toarray() + d)
+    except np.linalg.LinAlgError as error:
+        raise SingularChainError("parts of the chain are all but closed") from error
     noise = np.zeros((n_states, n_actions))
     used = part.used[states]
     known = used & (rows.n[states] > 1.5)  # what one draw leaves open is a rule's, and no measurement

@@ -11,7 +11,7 @@ import torch
 from conftest import overshooting, problems, random_mdp, random_policy, random_stream
 from hypothesis import strategies as st
 
-from erl_torch import AlgorithmS1, InputError, NonFiniteError, Solution, Status, Transitions, collect, kernels
+from erl_torch import AlgorithmS1, InputError, ListedS1, NonFiniteError, Solution, Status, Transitions, collect, kernels
 from erl_torch.empirical import tally
 from erl_torch.envs.windy_cliff import WindyCliffEnv
 
@@ -340,7 +340,7 @@ def test_rho_is_clipped_at_its_bound(implementation, largest_reward):
     """At max(1, exp(beta max r)), and not without clip_rho."""
     data, steps = overshooting(largest_reward), dict(beta=5.0, lr_u=0.05, lr_rho=0.1)
     bound = max(1.0, math.exp(5.0 * largest_reward))
-    learner = AlgorithmS1(n_epochs=1, n_bias=1, implementation=implementation, **steps)
+    learner = ListedS1(n_epochs=1, n_bias=1, implementation=implementation, **steps)
     clipped, free = (
         oracle.lines_9_to_11(data, (2, 1), **steps, rho_max=bound),
         oracle.lines_9_to_11(data, (2, 1), **steps),
@@ -377,7 +377,7 @@ def test_the_psi_phase_ends_by_the_larger_relative_error(psi, keep):
 def test_cliff_figure_5():
     env = WindyCliffEnv()
     data = collect(env, 500, 1000, 0)
-    solution = AlgorithmS1(rho_init="carry", self_loop="old").fit(data, 15, 4)
+    solution = AlgorithmS1().fit(data, 15, 4)
     assert solution.status is Status.COMPLETED
     assert solution.n_steps == 45_000_000
     assert solution.theta == pytest.approx(1.0101363366, abs=0.01)
@@ -394,13 +394,13 @@ def test_visited_states_only():
     assert (few == 2).any()
     options = dict(beta=3.0, lr_u=0.05, n_epochs=3, n_bias=3, prior_policy=prior)
     for implementation in IMPLEMENTATIONS:
-        solution = AlgorithmS1(unvisited="prior", implementation=implementation, **options).fit(data, 6, 3)
+        solution = ListedS1(unvisited="prior", implementation=implementation, **options).fit(data, 6, 3)
         # States 4 and 5 never occur, nor does action 2 in state 1.
         np.testing.assert_allclose(solution.policy[4:], prior[4:], rtol=1e-14)
         assert solution.policy[1, 2] == pytest.approx(prior[1, 2], rel=1e-14)
         assert abs(solution.policy[1, 0] - prior[1, 0]) > 1e-3
         assert solution.reward_bias[4:].abs().max() == 0
-        listing = AlgorithmS1(implementation=implementation, **options).fit(data, 6, 3)
+        listing = ListedS1(implementation=implementation, **options).fit(data, 6, 3)
         np.testing.assert_allclose(listing.policy[4:], prior[4:], rtol=1e-14)
 
 
@@ -463,7 +463,7 @@ def test_psi_limit_is_reported(authors_tuples):
 
 def test_a_psi_phase_cut_short_is_remembered(authors_tuples):
     """The last one meets its tolerance, an earlier one did not."""
-    solution = AlgorithmS1(n_epochs=1, n_bias=8, max_psi_epochs=60).fit(authors_tuples, 15, 4)
+    solution = ListedS1(n_epochs=1, n_bias=8, max_psi_epochs=60).fit(authors_tuples, 15, 4)
     assert solution.history["psi_error"][-1] < 1e-4 < solution.history["psi_error"].max()
     assert solution.status is Status.PSI_LIMIT
 

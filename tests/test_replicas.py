@@ -18,6 +18,7 @@ from test_config import composed
 from erl_torch import (
     AlgorithmS1,
     InputError,
+    ListedS1,
     NonFiniteError,
     Replicas,
     ReplicaSolution,
@@ -190,7 +191,7 @@ def test_replicas_clip_rho(backend):
 
 
 def test_a_psi_phase_cut_short_is_remembered(authors_tuples):
-    learner = AlgorithmS1(n_epochs=1, n_bias=8, max_psi_epochs=60)
+    learner = ListedS1(n_epochs=1, n_bias=8, max_psi_epochs=60)
     found = Replicas.of(learner, lr_psi=[0.1, 1.0]).fit(authors_tuples, 15, 4)
     assert [solution.history["psi_error"][-1] < 1e-4 for solution in found.solutions] == [True, True]
     assert [solution.status for solution in found.solutions] == [Status.PSI_LIMIT, Status.COMPLETED]

@@ -121,7 +121,7 @@ def solve_log_perron(
     for step in range(max_steps + 1):
         spread = np.ptp(gain)
         rounding = 64 * np.finfo(np.float64).eps * (1 + np.abs(h).max() + np.abs(gain).max())
-        if spread <= max(rtol, rounding if spread > 0.25 * before else 0.0):
+        if rounding < 0.1 and spread <= max(rtol, rounding if spread > 0.25 * before else 0.0):
             return h, bounds_of(gain), Status.CONVERGED, step
         if step == max_steps:
             break

@@ -62,6 +62,8 @@ class Problem:
         """What tolerances are relative to, reward a step: max(|theta|, mean |r| that ``policy`` [n, A] meets in the
         long run), but not above the reward range; rewards that it never meets do not count. Where both are 0, the
         smallest |r| that is not."""
+        if np.ptp(self.reward) == 0:
+            return self.reward_range
         seen = abs(theta)
         # A class that falls apart in double precision: theta alone.
         with contextlib.suppress(SingularChainError):
