@@ -156,8 +156,8 @@ def certified(out: dict[str, Any], oracle: Oracle, mdp: TabularMDP, rate: Rate, 
             if certificates is None:
                 continue
             j = certificates.objective(mdp.transition, mdp.reward, total, given.beta, policy, mdp.start)
-            if not mpf(j.low) <= worth <= mpf(j.high):
-                size = max(mpf(j.low) - worth, worth - mpf(j.high))
+            size = max(mpf(j.low) - worth, worth - mpf(j.high))
+            if size > oracle.rounding:
                 _wrong(out, f"objective of {name}", f"{j} leaves out {mp.nstr(worth, 17)}", size)
             routes = {
                 "evaluation.objective": evaluation.objective(mdp, policy, total, given.beta),
