@@ -206,6 +206,10 @@ class Oracle:
         self.reward = [[mpf(float(x)) for x in row] for row in given.reward]
         self.prior = [shares(row) for row in given.prior]
         self.beta = mpf(given.beta)
+        # Far above that of these numbers, far below that of doubles; it counts where theta* is 0 to all digits.
+        largest = max(abs(x) for row in self.reward for x in row)
+        surprise = max(abs(mp.log(x)) for row in self.prior for x in row)
+        self.rounding = mpf(10) ** (15 - DIGITS[0]) * (largest + surprise / self.beta)
 
     # -- a policy's worth
 
@@ -327,7 +331,8 @@ class Oracle:
                         break
                     value, beta = found[0], min(8 * beta, self.beta)
                 if found is not None:
-                    return found[1:]
+                    _, low, high, seen = found
+                    return low - self.rounding, high + self.rounding, seen
         raise NoRateError(f"{len(inside)} states")
 
     def _newton(
