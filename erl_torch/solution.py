@@ -6,6 +6,7 @@ import enum
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
+from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,19 @@ class Status(enum.Enum):
     PSI_LIMIT = "the psi phase met max_psi_epochs before psi_tol: raise max_psi_epochs or lr_psi"
     UNCERTIFIED = "the certificate is wider than asked for, as the message says; the bound holds as it stands"
     NON_FINITE = "a table left the positive finite numbers; the tables are those of the last good epoch"
+
+
+def proven(bounds: tuple[float, float], gap: float | None) -> str:
+    """Bounds on theta* and on a policy's loss as text, rounded away from what they enclose."""
+    low, high = _rounded(bounds[0], 10, ROUND_FLOOR), _rounded(bounds[1], 10, ROUND_CEILING)
+    loss = "" if gap is None else f"; objective at most {_rounded(gap, 2, ROUND_CEILING)} below its maximum"
+    return f"theta* in [{low}, {high}]{loss}"
+
+
+def _rounded(x: float, digits: int, way: str) -> str:
+    if not np.isfinite(x):
+        return f"{x:g}"
+    return f"{float(Context(prec=digits, rounding=way).create_decimal(Decimal(x))):.{digits}g}"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

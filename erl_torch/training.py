@@ -43,7 +43,7 @@ from erl_torch.notes import collected, note
 from erl_torch.recordings import FileRecording, check_target, open_recording
 from erl_torch.reservations import Reservation
 from erl_torch.rng import Streams, streams
-from erl_torch.solution import Solution, Status
+from erl_torch.solution import Solution, Status, proven
 from erl_torch.solvers import certify, solve_soft_bellman
 from erl_torch.transitions import Recording
 from erl_torch.uncertainty import Estimate, theta_uncertainty
@@ -803,9 +803,7 @@ def _summary(
         *(f"{name:18}{before}{after}" for name, before, after in rows),
     ]
     if result["theta_bounds"] is not None:
-        low, high = result["theta_bounds"]
-        gap = "" if result["gap"] is None else f"; objective at most {result['gap']:.2g} below its maximum"
-        lines.append(f"{'proven':18}theta* in [{low:.10g}, {high:.10g}]{gap}")
+        lines.append(f"{'proven':18}{proven(result['theta_bounds'], result['gap'])}")
     if result["data"]:
         fewest = result["data_smallest_visits"]
         rests = "" if fewest is None else f" (95%; {fewest} visits or more of each pair that counts)"

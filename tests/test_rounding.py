@@ -16,6 +16,7 @@ from erl_torch.chains import RegenerativeLU, SingularChainError, long_run
 from erl_torch.evaluation import Judge
 from erl_torch.evaluation import objective as worth
 from erl_torch.notes import Note
+from erl_torch.solution import proven
 
 
 @pytest.fixture(autouse=True)
@@ -341,3 +342,11 @@ def test_a_policy_that_stays_put_has_a_gap_in_every_chain():
     gap = certify(replace(best, policy=stay), mdp, 1.0, best=best).gap
     assert gap == pytest.approx(-best.theta - (0.25 - np.log(2)), abs=1e-9)
     assert gap >= -best.theta_bounds[1] - (0.25 - np.log(2))
+
+
+def test_bounds_are_printed_away_from_what_they_enclose():
+    assert proven((1.0101363366049483, 1.0101363366056269), 0.00261) == (
+        "theta* in [1.010136336, 1.010136337]; objective at most 0.0027 below its maximum"
+    )
+    assert proven((-0.1, 0.3), 0.5) == "theta* in [-0.1000000001, 0.3]; objective at most 0.5 below its maximum"
+    assert proven((-np.inf, np.inf), None) == "theta* in [-inf, inf]"
