@@ -14,8 +14,8 @@ from omegaconf import OmegaConf
 
 from erl_torch import InputError, checks, cli, config
 from erl_torch.checks import InputError as ChecksInputError
-from erl_torch.learners import LEARNERS
-from erl_torch.training import train
+from erl_torch.learners import LEARNERS, AlgorithmS1, ListedS1
+from erl_torch.training import make_learner, train
 
 CONF = Path(__file__).parents[1] / "conf"
 config.register()
@@ -262,3 +262,12 @@ def test_input_errors_are_value_errors_on_one_line():
     assert isinstance(error, ValueError)
     assert InputError is ChecksInputError
     assert str(error) == "group.key=a b: must be c"
+
+
+@pytest.mark.parametrize(("name", "python"), [("s1", AlgorithmS1()), ("s1_listing", ListedS1())])
+def test_the_command_line_and_python_have_one_set_of_defaults(name, python):
+    """On the windy cliff, where README's figures are."""
+    made = make_learner(composed(f"learner={name}").learner, 15, 4)
+    assert type(made) is type(python)
+    for item in fields(python):
+        assert getattr(made, item.name) == getattr(python, item.name), item.name
