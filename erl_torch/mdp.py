@@ -190,10 +190,7 @@ def _csr_of_parts(parts: Sequence[np.ndarray], sizes: tuple[int, ...]) -> sp.csr
 
 def _csr(value: Any, n_states: int, n_actions: int) -> sp.csr_array:
     if hasattr(value, "layout") and hasattr(value, "to_sparse_coo"):  # a torch tensor
-        value = value.detach().cpu()
-        if str(value.layout) != "torch.strided":
-            value = value.to_sparse_coo().coalesce()
-            value = sp.coo_array((value.values().numpy(), tuple(value.indices().numpy())), shape=tuple(value.shape))
+        value = _scipy(value.detach().cpu())
     if not sp.issparse(value):
         value = _dense("transition", value)
         if value.shape == (n_states, n_actions, n_states):
@@ -205,14 +202,41 @@ def _csr(value: Any, n_states: int, n_actions: int) -> sp.csr_array:
             f"of shape [{n_states * n_actions}, {n_states}] to go with reward [{n_states}, {n_actions}]",
         )
     try:
+        # Before anything is converted: conversions and compiled loops trust the indices.
+        if sp.issparse(value) and hasattr(value, "check_format"):
+            value.check_format(full_check=True)
+        elif sp.issparse(value) and value.format == "coo":
+            value = sp.coo_array((value.data, value.coords), shape=value.shape)
         csr = sp.csr_array(value, dtype=np.float64, copy=True)
-        csr.check_format(full_check=True)  # compiled loops trust the indices
+        csr.check_format(full_check=True)
     except (ValueError, TypeError, IndexError) as error:
         raise InputError("transition", "sparse matrix", f"a matrix [S*A, S] with indices in range ({error})") from error
     csr.sum_duplicates()
     csr.eliminate_zeros()
     csr.sort_indices()
     return csr
+
+
+def _scipy(value: Any) -> Any:
+    """A torch tensor as an array, or as a sparse one where it is."""
+    import torch
+
+    if value.layout is torch.strided:
+        return value
+    try:
+        if value.layout is not torch.sparse_coo:  # torch does not look at these indices by itself
+            by_row = value.layout in (torch.sparse_csr, torch.sparse_bsr)
+            parts = (
+                (value.crow_indices(), value.col_indices()) if by_row else (value.ccol_indices(), value.row_indices())
+            )
+            torch.sparse_compressed_tensor(
+                *parts, value.values(), value.shape, layout=value.layout, check_invariants=True
+            )
+        value = value.to_sparse_coo().coalesce()
+        return sp.coo_array((value.values().numpy(), tuple(value.indices().numpy())), shape=tuple(value.shape))
+    except (ValueError, RuntimeError) as error:
+        said = str(error).splitlines()[0][:120]
+        raise InputError("transition", "sparse tensor", f"a matrix [S*A, S] with indices in range ({said})") from error
 
 
 def _row_name(row: int, n_actions: int) -> str:

@@ -1,5 +1,6 @@
 """Bounds in floating point against many digits: mpmath and fractions, straight from the equations."""
 
+import warnings
 from dataclasses import replace
 from fractions import Fraction
 
@@ -266,9 +267,21 @@ def test_a_printed_table_is_solved_as_its_normalised_rows(solve):
     assert found.theta_bounds[0] <= -1 / n <= found.theta_bounds[1]
 
 
-def test_indices_out_of_range_are_named():
-    p = sp.csr_array((np.ones(2), np.array([0, 1]), np.array([0, 1, 2])), shape=(2, 2))
-    p.indices = np.array([0, 700_000_000], np.int32)
+@pytest.mark.parametrize("layout", ["csr", "csc", "coo", "bsr", "torch csr", "torch csc"])
+def test_indices_out_of_range_are_named(layout):
+    """Whatever the form: a conversion would read or write outside its arrays."""
+    if layout.startswith("torch"):
+        make = torch.sparse_csr_tensor if layout.endswith("csr") else torch.sparse_csc_tensor
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # torch calls the layout a beta
+            far = torch.tensor([0, 700_000_000])
+            p = make(torch.tensor([0, 1, 2]), far, torch.ones(2), size=(2, 2), check_invariants=False)
+    else:
+        p = getattr(sp, f"{layout}_array")(np.eye(2))
+        if layout == "coo":
+            p.coords[1][1] = 700_000_000
+        else:
+            p.indices[1] = 700_000_000
     with pytest.raises(InputError, match="indices in range"):
         TabularMDP(p, np.ones((2, 1)))
 
