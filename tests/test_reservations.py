@@ -331,8 +331,9 @@ def test_actions_in_states_that_are_met_a_few_times_count_together():
 def test_declarations():
     asks = {name: (one.averages_exp_reward, one.drawn_from_prior) for name, one in
             ((n, c()) for n, c in LEARNERS.items() if n != "exact")}  # fmt: skip
-    assert {name for name, (exp, _) in asks.items() if exp} == {"s1", "u_learning", "z_learning"}
-    assert {name: column for name, (_, column) in asks.items() if column} == {"s1": "a_next", "z_learning": "a"}
+    assert {name for name, (exp, _) in asks.items() if exp} == {"s1", "s1_listing", "u_learning", "z_learning"}
+    drawn = {name: column for name, (_, column) in asks.items() if column}
+    assert drawn == {"s1": "a_next", "s1_listing": "a_next", "z_learning": "a"}
     assert EfficientS1.published().averages_exp_reward
     assert EfficientS1.published().drawn_from_prior == "a_next"
 

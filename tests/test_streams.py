@@ -21,6 +21,7 @@ from erl_torch import (
     EfficientS1,
     FileRecording,
     InputError,
+    ListedS1,
     Replicas,
     Transitions,
     collect,
@@ -258,7 +259,7 @@ def test_refusals(tmp_path):
 def test_a_failure_names_its_tuple_wherever_it_is_read_from():
     data = Transitions(PLAIN.s, PLAIN.a, PLAIN.r.copy(), PLAIN.s_next, PLAIN.a_next)
     data.r[7777:] -= 300.0
-    found = [AlgorithmS1(3.0, lr_u=0.8).fit(d, 5, 3) for d in (data, Cut(data, 999))]
+    found = [ListedS1(3.0, lr_u=0.8).fit(d, 5, 3) for d in (data, Cut(data, 999))]
     assert int(re.search(r"at tuple (\d+)", found[0].message)[1]) > 7777  # in the third chunk
     same(found[1], found[0])
 

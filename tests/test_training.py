@@ -356,6 +356,7 @@ def test_a_refused_command_leaves_the_run_s_own(typed_here, tmp_path):
 def test_resume_takes_only_what_a_run_begins_with(typed_here, tmp_path, monkeypatch, content, expected):
     (tmp_path / "mine.py").write_text("raise SystemExit('imported')\n")
     monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "mine", raising=False)  # another test's
     path = tmp_path / "run" / ".hydra" / "overrides.yaml"
     path.parent.mkdir(parents=True)
     path.write_bytes(content)
