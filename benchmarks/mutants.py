@@ -38,6 +38,7 @@ ROOT = Path(__file__).parents[1]
 TREE = (
     "erl_torch",
     "tests",
+    "benchmarks",
     "conf",
     "docs",
     "examples",

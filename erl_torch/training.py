@@ -423,7 +423,7 @@ class _Solving:
         return (self.names(state) if state.step else {}) | evaluation_tags(measured)
 
     def postfix(self, state: ExactState) -> str:
-        return f"theta {state.theta:.6f} in [{state.theta_bounds[0]:.6f}, {state.theta_bounds[1]:.6f}]"
+        return f"theta {state.theta:.6f} {proven(state.theta_bounds, None)}"
 
     def bar(self) -> tqdm:
         return learning_bar(None, self.unit)
@@ -485,7 +485,8 @@ def _data_tags(estimate: Estimate | None) -> dict[str, float]:
 
 def _say(milestone: str, state: Any, measured: Evaluation) -> None:
     if isinstance(state, ExactState):
-        found = f"theta {state.theta:.10f} in [{state.theta_bounds[0]:.10f}, {state.theta_bounds[1]:.10f}]  "
+        # A biasing iteration's own theta is optimistic: below theta* until the last.
+        found = f"theta {state.theta:.10f}  {proven(state.theta_bounds, None)}  "
     else:
         found = f"rho {state.rho:.4e}  " if hasattr(state, "rho") else ""
         found += "" if state.theta is None else f"theta {state.theta:.5f}  "
