@@ -11,7 +11,16 @@ import torch
 from conftest import random_mdp, random_policy
 from mpmath import mp, mpf
 
-from erl_torch import InputError, Status, TabularMDP, certify, iterate_biasing, solve_biasing, solve_soft_bellman
+from erl_torch import (
+    InputError,
+    Status,
+    TabularMDP,
+    certify,
+    iterate_biasing,
+    kernels,
+    solve_biasing,
+    solve_soft_bellman,
+)
 from erl_torch.certificates import gains, objective, policy_gains
 from erl_torch.chains import RegenerativeLU, SingularChainError, long_run
 from erl_torch.evaluation import Judge
@@ -363,3 +372,13 @@ def test_bounds_are_printed_away_from_what_they_enclose():
     )
     assert proven((-0.1, 0.3), 0.5) == "theta* in [-0.1000000001, 0.3]; objective at most 0.5 below its maximum"
     assert proven((-np.inf, np.inf), None) == "theta* in [-inf, inf]"
+
+
+def test_digits_lost_below_the_range_of_numbers_are_known():
+    """2 is reached with 1e-155 twice and left with 1e-307: one share in a thousand, of a product that has few digits."""
+    chain = np.array([[1.0, 1e-155, 0.0], [1.0, 0.0, 1e-155], [1e-307, 0.0, 1.0]])
+    share, sound = kernels.gth(chain.copy())
+    true = float(rational_shares(chain)[2])
+    assert 1e-4 < true < 1e-2
+    assert abs(share[2] / true - 1) > 1e-9
+    assert not sound
