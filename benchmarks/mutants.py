@@ -957,7 +957,7 @@ MUTANTS = [
         "kernels.py",
         "        if abs(x) < 0.1:\n",
         "        if abs(x) < 0.0:\n",
-        "test_rounding.py::test_policy_gains_lie_between_their_ends",
+        "test_rounding.py::test_policies_close_to_the_prior_have_narrow_gains",
     ),
     Mutant(
         "a drift of a policy without its error",
@@ -971,14 +971,14 @@ MUTANTS = [
         "certificates.py",
         "slack = (1.2 * error + (len(d) + 8) * EPSILON) * float(d @ off) + 4 * EPSILON * abs(found)",
         "slack = 0.0 * error",
-        "test_certificates.py",
+        "test_rounding.py::test_worth_of_random_chains_lies_between_its_bounds",
     ),
     Mutant(
         "worth from all states, reached or not",
         "certificates.py",
         "ends = closed[label] & reachable_from(chain, start)",
         "ends = np.ones(len(start), bool)",
-        "test_rounding.py::test_a_policy_that_stays_put_has_a_gap_in_every_chain",
+        "test_rounding.py::test_worth_of_random_chains_lies_between_its_bounds",
     ),
     Mutant(
         "the probability of ending in a class is left out",
@@ -997,8 +997,8 @@ MUTANTS = [
     Mutant(
         "indices of sparse matrices are trusted",
         "mdp.py",
-        "        csr.check_format(full_check=True)  # compiled",
-        "        csr.check_format(full_check=False)  # compiled",
+        "            value.check_format(full_check=True)\n",
+        "            pass\n",
         "test_rounding.py::test_indices_out_of_range_are_named",
     ),
     Mutant(

@@ -101,7 +101,7 @@ def test_policy_gains_lie_between_their_ends():
 def rational_shares(chain):
     """Stationary distribution of a dense chain, by elimination in fractions from the off-diagonal entries."""
     n = len(chain)
-    p = [[Fraction(float(x)) for x in row] for row in chain]
+    p = [[x if isinstance(x, Fraction) else Fraction(float(x)) for x in row] for row in chain]
     for k in range(n - 1, 0, -1):
         out = sum(p[k][:k])
         for i in range(k):
@@ -298,7 +298,7 @@ def test_indices_out_of_range_are_named(layout):
 def test_states_that_are_never_left_do_not_reach_superlu(monkeypatch):
     monkeypatch.setattr("erl_torch.chains.SPARSE_STATES", 0)
     chain = sp.csr_array(np.array([[0.5, 0.5, 0.0], [0.0, 1.0, 0.0], [0.5, 0.0, 0.5]]))
-    with pytest.raises(SingularChainError):
+    with pytest.raises(SingularChainError, match="state 1 is never left"):
         RegenerativeLU(chain, 0)
 
 
@@ -384,3 +384,33 @@ def test_digits_lost_below_the_range_of_numbers_are_known():
     assert 1e-12 < true < 1e-10
     assert abs(share[2] / true - 1) > 1e-9
     assert not sound
+
+
+def test_worth_of_random_chains_lies_between_its_bounds():
+    """In fractions; a closed state that the start does not lead to, worth 100, plays no part."""
+    rng = np.random.default_rng(6)
+    for _ in range(100):
+        n = int(rng.integers(2, 7))
+        chain = np.zeros((n + 1, n + 1))
+        chain[:n, :n] = rng.random((n, n)) * 10.0 ** rng.uniform(-9, 0, (n, n))
+        chain[n, n] = 1.0
+        reward = np.append(rng.normal(size=n) * 10.0 ** rng.uniform(-3, 3, n), 100.0)[:, None]
+        mdp = TabularMDP(chain / chain.sum(1, keepdims=True), reward, np.eye(n + 1)[0])
+        one = np.ones((n + 1, 1))
+        found = objective(mdp.transition, reward, one, 1.0, one, mdp.start)
+        dense = mdp.transition.toarray()[:n, :n]
+        exact_rows = [[Fraction(float(x)) for x in row] for row in dense]
+        shares = rational_shares(np.array([[x / sum(row) for x in row] for row in exact_rows], dtype=object))
+        true = sum(d * Fraction(float(r)) for d, r in zip(shares, reward[:n, 0], strict=True))
+        assert Fraction(found.low) <= true <= Fraction(found.high)
+        assert found.high - found.low <= 1e-9 * np.abs(reward[:n]).max()
+
+
+def test_policies_close_to_the_prior_have_narrow_gains():
+    """KL(1/2 +- x || 1/2) = 2 x^2 to leading order; at beta 1e-6 a rounding of the logarithms would be a million times
+    as large as KL/beta."""
+    policy, prior, x = np.array([[0.5 + 2.0**-30, 0.5 - 2.0**-30]]), np.array([[0.5, 0.5]]), 2.0**-30
+    transition = sp.csr_array(np.ones((2, 1)))
+    low, high = policy_gains(transition, np.zeros((1, 2)), prior, 1e-6, policy, np.zeros(1))
+    assert -2 * x**2 / 1e-6 == pytest.approx(0.5 * (low[0] + high[0]), rel=1e-5)
+    assert high[0] - low[0] < 1e-15
