@@ -101,7 +101,7 @@ class FileRecording:
             prior = check_policy("prior_policy", prior_policy, n_states, n_actions)
             self._source = _Minari(str(path), env, prior, on_prior, seed)
         elif not Path(path).exists():
-            raise InputError("path", path, "an npz or Parquet file or a directory of columns, or minari:DATASET")
+            raise InputError("path", path, "there: an npz or Parquet file, a directory of columns, or minari:DATASET")
         elif Path(path).suffix == ".parquet" and Path(path).is_file():
             self._source = _Parquet(str(path))
         else:
