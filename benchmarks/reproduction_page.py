@@ -31,9 +31,9 @@ HEAD = """# The whole paper, one command each
 
 `NAME` is one of the artifacts below. Numbers come as CSV and JSON, the picture as PNG and SVG, in
 `runs/reproduce/NAME-SCALE-seedSEED`. A run that was stopped or killed goes on with the units of work that are missing.
-On one machine the same seed gives the same files, byte for byte, for any number of `processes` (a second run of Figures
-1, 2, 4, 5, S1 and Table S1 gave the same 24 files; Figure 3 and Table S2 were not run twice); other processors and other
-versions of NumPy, SciPy and Matplotlib may round the last digits otherwise.
+On one machine the same seed gives the same files, byte for byte, for any number of `processes` (a second run of
+Figures 1, 2, 4, 5, S1 and Table S1 gave the same 24 files; Figure 3 and Table S2 were not run twice); other processors
+and other versions of NumPy, SciPy and Matplotlib may round the last digits otherwise.
 
 **Reproduced** means one thing. A number with no chance in it: equal to half a unit of the last digit given. A mean: the
 difference from ours is no more than 95 % of differences would be were both samples of one law, by its standard error,
