@@ -967,20 +967,6 @@ MUTANTS = [
         "test_rounding.py::test_policy_gains_lie_between_their_ends",
     ),
     Mutant(
-        "worth without the error of the shares",
-        "certificates.py",
-        "slack = (1.2 * error + (len(d) + 8) * EPSILON) * float(d @ off) + 4 * EPSILON * abs(found)",
-        "slack = 0.0 * error",
-        "test_rounding.py::test_worth_of_random_chains_lies_between_its_bounds",
-    ),
-    Mutant(
-        "worth from all states, reached or not",
-        "certificates.py",
-        "ends = closed[label] & reachable_from(chain, start)",
-        "ends = np.ones(len(start), bool)",
-        "test_rounding.py::test_worth_of_random_chains_lies_between_its_bounds",
-    ),
-    Mutant(
         "the probability of ending in a class is left out",
         "chains.py",
         "share[inside] = mass * part.of_state",
