@@ -106,14 +106,23 @@ def objective(
     gains of its relative value, and its shares of time where the elimination's error is known.
     """
     n_states, n_actions = reward.shape
+    sums = policy.sum(1, keepdims=True)
+    policy = np.where(np.abs(sums - 1) > 2e-15, policy / sums, policy)
     chain = policy_chain(transition, policy)
-    label, closed = classes(chain)
-    ends = closed[label] & reachable_from(chain, start)
+    # Which state can follow which, whatever products of probabilities underflow.
+    possible = sp.csr_array((np.ones(transition.nnz), transition.indices, transition.indptr), shape=transition.shape)
+    pattern = policy_chain(possible, (policy > 0).astype(np.float64))
+    label, closed = classes(pattern)
+    ends = closed[label] & reachable_from(pattern, start)
     within = policy_gains(transition, reward, prior, beta, policy, np.zeros(n_states))
     low, high = float(within[0][ends].min()), float(within[1][ends].max())
     if not (np.isfinite(low) and np.isfinite(high)):
         return Objective(low, low, high)
     worth = one_step_worth(*within)
+    if chain.nnz < pattern.nnz:
+        share = _share(chain, start)
+        found = 0.5 * (low + high) if share is None else float(share.of_state @ worth)
+        return Objective(min(max(found, low), high), low, high)
     ends_in = np.unique(label[ends])
     share = _share(chain, start) if ends.sum() <= GTH_STATES else None
     if share is None or not np.isfinite(share.relative_error):

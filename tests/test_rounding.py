@@ -414,3 +414,39 @@ def test_policies_close_to_the_prior_have_narrow_gains():
     low, high = policy_gains(transition, np.zeros((1, 2)), prior, 1e-6, policy, np.zeros(1))
     assert -2 * x**2 / 1e-6 == pytest.approx(0.5 * (low[0] + high[0]), rel=1e-5)
     assert high[0] - low[0] < 1e-15
+
+
+def test_worth_where_products_of_probabilities_underflow():
+    """1e-200 of choosing to go and 1e-200 of arriving: 1e-400, which is 0 in doubles, and still the way out of 0."""
+    t = np.array([[[1.0, 0.0], [1.0, 1e-200]], [[0.0, 1.0], [0.0, 1.0]]])
+    mdp = TabularMDP(t, [[0.0, 0.0], [-5.0, -5.0]], [1.0, 0.0])
+    prior = np.full((2, 2), 0.5)
+    policy = np.array([[1.0, 1e-200], [0.5, 0.5]])
+    found = objective(mdp.transition, mdp.reward, prior, 1.0, policy, mdp.start)
+    assert found.low <= -5 <= found.high  # in the end it is in 1 for ever
+    assert found.low <= found.value <= found.high
+
+
+def test_policies_of_single_precision_are_certified_as_their_normalised_rows():
+    rng = np.random.default_rng(7)
+    for _ in range(50):
+        mdp, prior = random_mdp(rng, 3, 3), random_policy(rng, 3, 3)
+        policy = random_policy(rng, 3, 3).astype(np.float32).astype(np.float64)
+        rows = [[Fraction(float(x)) for x in row] for row in policy]
+        rows = [[x / sum(row) for x in row] for row in rows]
+        p = [[Fraction(float(x)) for x in row] for row in mdp.transition.toarray()]
+        chain = [
+            [sum(rows[s][a] * p[3 * s + a][j] / sum(p[3 * s + a]) for a in range(3)) for j in range(3)]
+            for s in range(3)
+        ]
+        shares = rational_shares(np.array(chain, dtype=object))
+        true = mpf(0)
+        for s in range(3):
+            mass = sum(mpf(float(x)) for x in prior[s])
+            for a in range(3):
+                pi = mpf(rows[s][a].numerator) / rows[s][a].denominator
+                worth_of = mpf(mdp.reward[s, a]) - mp.log(pi * mass / mpf(prior[s, a])) / 2
+                true += mpf(shares[s].numerator) / shares[s].denominator * pi * worth_of
+        found = objective(mdp.transition, mdp.reward, prior, 2.0, policy, mdp.start)
+        assert mpf(found.low) <= true <= mpf(found.high)
+        assert found.high - found.low < 1e-10

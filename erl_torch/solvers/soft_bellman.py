@@ -24,7 +24,7 @@ import numpy as np
 from erl_torch import checks
 from erl_torch.certificates import soft_backup
 from erl_torch.chains import RegenerativeLU, SingularChainError
-from erl_torch.mdp import TabularMDP
+from erl_torch.mdp import TabularMDP, check_policy
 from erl_torch.solution import Solution
 from erl_torch.solvers.problem import Problem
 from erl_torch.solvers.result import Sized, ended, policy_gap, reducible_solution
@@ -109,7 +109,7 @@ def certify(
     problem = Problem.of(mdp, beta, prior_policy)
     bounds = (best or solve_soft_bellman(mdp, beta, prior_policy)).theta_bounds
     assert bounds is not None
-    policy = solution.policy.detach().cpu().numpy()[problem.states]
+    policy = check_policy("policy", solution.policy, mdp.n_states, mdp.n_actions)[problem.states]
     return replace(solution, theta_bounds=bounds, gap=policy_gap(problem, policy, bounds), beta=beta)
 
 
