@@ -58,13 +58,13 @@ class Problem:
         """max r - min r, or max |r| if that is 0, or 1."""
         return float(np.ptp(self.reward)) or float(np.abs(self.reward).max()) or 1.0
 
-    def scale_seen(self, policy: np.ndarray, theta: float) -> float:
+    def scale_seen(self, policy: np.ndarray, bounds: tuple[float, float]) -> float:
         """What tolerances are relative to, reward a step: max(|theta|, mean |r| that ``policy`` [n, A] meets in the
-        long run), but not above the reward range; rewards that it never meets do not count. Where both are 0, the
-        smallest |r| that is not."""
+        long run), but not above the reward range; rewards that it never meets do not count. Where both are 0 (or theta
+        may be, by its ``bounds``), the smallest |r| that is not."""
         if np.ptp(self.reward) == 0:
             return self.reward_range
-        seen = abs(theta)
+        seen = max(bounds[0], -bounds[1], 0.0)
         # A class that falls apart in double precision: theta alone.
         with contextlib.suppress(SingularChainError):
             share = self.regeneration(policy).stationary()
@@ -80,7 +80,7 @@ class Problem:
         if not width <= tol * self.reward_range:
             return False
         # The second test takes an LU.
-        return width <= tol * abs(theta) or width <= tol * self.scale_seen(policy, theta)
+        return width <= tol * abs(theta) or width <= tol * self.scale_seen(policy, bounds)
 
     def gains(self, value: np.ndarray) -> Gains:
         """TV - V of ``value`` [n], with bounds."""
