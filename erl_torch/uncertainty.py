@@ -187,8 +187,9 @@ def bootstrap_theta(
     checks.at_least("n_resamples", n_resamples, 2)
     rng = np.random.default_rng(seed)
     part = model.problem(beta, prior_policy)
-    value = solve_problem(part.problem, model, prior_policy).theta
-    assert value is not None
+    bounds = solve_problem(part.problem, model, prior_policy).theta_bounds
+    assert bounds is not None
+    value = 0.5 * sum(bounds)
     p, visits = model.transition, model.visits.ravel()
     rows = np.repeat(np.arange(len(visits)), np.diff(p.indptr))
     within = _within(model, p.data, rows)

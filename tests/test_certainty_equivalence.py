@@ -21,6 +21,7 @@ from erl_torch import (
 )
 from erl_torch.envs.windy_cliff import WindyCliffEnv
 from erl_torch.evaluation import objective
+from erl_torch.solvers.soft_bellman import solve_problem
 
 CLIFF = WindyCliffEnv().mdp
 
@@ -149,3 +150,16 @@ def test_loss_falls_as_one_over_tuples():
         fits = [CertaintyEquivalence().fit(collect(CLIFF, n, 1000, seed), 15, 4) for seed in range(6)]
         gaps.append(np.mean([-theta - objective(CLIFF, f.policy.numpy(), np.full((15, 4), 0.25), 10.0) for f in fits]))
     assert 0 <= gaps[1] < gaps[0] / 4
+
+
+def test_a_stream_that_leaves_states_for_ever_has_an_estimate():
+    """0 is better off never to leave, and is left at last: no one theta is proven, and the learner has an estimate."""
+    s = [0] * 50 + [1] * 50
+    data = Transitions(s, [0] * 50 + [1] * 50, [1.0] * 49 + [0.0] * 51, [*s[1:], 1], [0] * 100)
+    found = CertaintyEquivalence(5.0).fit(data, 2, 2)
+    assert np.isfinite(found.theta)
+    assert torch.isfinite(found.policy).all()
+    bounds_middle = solve_problem(
+        empirical_mdp(data, 2, 2).problem(5.0).problem, empirical_mdp(data, 2, 2)
+    ).theta_bounds
+    assert found.theta == pytest.approx(0.5 * sum(bounds_middle))

@@ -255,8 +255,8 @@ def test_resamples_that_fall_apart_are_left_out():
     zero = np.zeros(400, int)
     model = empirical_mdp(Transitions(s, zero, r, s_next, zero), 4, 1)
     found = bootstrap_theta(model, 1.0, n_resamples=300, seed=0)
-    # Each link is lost with probability (1 - 1/n)^n, about e^-1; with one, a half is left for ever and theta is 0 or -1;
-    # with both, there are two closed sets, and no one theta: a seventh of all.
+    # Each link is lost with probability (1 - 1/n)^n, about e^-1; with one, a half is left for ever and theta is 0 or
+    # -1; with both, there are two closed sets, and no one theta: a seventh of all.
     left_out = 300 - len(found.samples)
     assert abs(left_out - 300 * np.exp(-2)) < 4 * np.sqrt(300 * np.exp(-2))
 

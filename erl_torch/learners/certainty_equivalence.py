@@ -127,14 +127,17 @@ class CertaintyEquivalence:
         part = stream.empirical
         answer = solve_problem(part.problem, stream.model, self.prior_policy, self.tol, self.max_steps)
         assert answer.theta_bounds is not None
-        theta, rho = answer.theta, answer.rho
-        assert theta is not None
-        assert rho is not None
         lower, upper = answer.theta_bounds
+        # An estimate, also where a set of states is left for ever and nothing is proven of one theta.
+        theta = 0.5 * (lower + upper) if answer.theta is None else answer.theta
+        with np.errstate(over="ignore", under="ignore"):
+            rho = float(np.exp(-self.beta * (theta + answer.reward_bias_max))) if answer.rho is None else answer.rho
         known = torch.from_numpy(part.used | ~part.used.any(1, keepdims=True))
         answer = replace(
             answer,
             u=answer.u * known,
+            theta=theta,
+            rho=rho,
             theta_bounds=None,  # what is proven of the empirical model is not proven of the true one
             gap=None,
             n_steps=stream.n_tuples,
