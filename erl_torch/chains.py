@@ -231,12 +231,13 @@ class RegenerativeLU:
 
         With x = c + discount K x, the discounted value, w = x - x[ref] and gain = (1 - discount) x[ref].
         """
-        gain, w = self._poisson(c)
-        if not refine:
-            return gain, w
-        # One refinement: the first answer is a difference of large numbers where ref is far.
-        more, dw = self._poisson(c + self.chain @ w - w - gain)
-        return gain + more, w + dw
+        with np.errstate(over="ignore", invalid="ignore"):  # the callers look at what comes out
+            gain, w = self._poisson(c)
+            if not refine:
+                return gain, w
+            # One refinement: the first answer is a difference of large numbers where ref is far.
+            more, dw = self._poisson(c + self.chain @ w - w - gain)
+            return gain + more, w + dw
 
     def _poisson(self, c: np.ndarray) -> tuple[float, np.ndarray]:
         x = c.copy()

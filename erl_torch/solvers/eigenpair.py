@@ -62,6 +62,11 @@ def perron(matrix: Any, rtol: float = 1e-13, max_steps: int = 60) -> PerronPair:
     Raises:
         InputError: not square, or an entry that is negative or not finite.
     """
+    try:
+        if sp.issparse(matrix) and hasattr(matrix, "check_format"):
+            matrix.check_format(full_check=True)
+    except (ValueError, IndexError) as error:
+        raise InputError("matrix", "sparse matrix", f"one with indices in range ({error})") from error
     m = sp.csr_array(matrix, dtype=np.float64, copy=True)
     if m.shape[0] != m.shape[1] or m.shape[0] == 0:
         raise InputError("matrix", f"array of shape {m.shape}", "square")
