@@ -103,9 +103,12 @@ def objective(
     """J(policy) with bounds.
 
     Three ways to bound it hold together: the one-step rewards of the states that the policy comes back to (V = 0), the
-    gains of its relative value, and its shares of time where the elimination's error is known.
+    gains of its relative value, and its shares of time where the elimination's error is known. Where products of
+    probabilities underflow, ``value`` is only somewhere between the bounds. The KL of states that the policy leaves for
+    ever does not count.
     """
     n_states, n_actions = reward.shape
+    policy = np.asarray(policy, np.float64)
     sums = policy.sum(1, keepdims=True)
     policy = np.where(np.abs(sums - 1) > 2e-15, policy / sums, policy)
     chain = policy_chain(transition, policy)
@@ -142,7 +145,7 @@ def objective(
     error = share.relative_error + 2 * n_states * (n_actions + 24) * EPSILON
     if error < 0.1:
         off = np.abs(worth[ends] - found)
-        slack = (1.2 * error + (len(d) + 8) * EPSILON) * float(d @ off) + 4 * EPSILON * abs(found)
+        slack = (1.2 * error + (len(d) + 8) * EPSILON) * float(d @ off) + (len(d) + 8) * EPSILON * abs(found)
         slack += len(d) * 1e-300 * float(off.max())
         low = max(low, found - 1.2 * float(d @ (worth - within[0])[ends]) - slack)
         high = min(high, found + 1.2 * float(d @ (within[1] - worth)[ends]) + slack)

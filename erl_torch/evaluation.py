@@ -169,10 +169,10 @@ class Judge:
         if self._small and (policy > 0).all():
             chain = sp.csr_array((self._chain(policy), self._columns, self._rows))
             share, sound = kernels.gth(chain[self._inside][:, self._inside].toarray())
-            if sound:
-                parts = (self.mdp.transition, self.mdp.reward, self.prior, beta, policy)
-                worth = one_step_worth(*policy_gains(*parts, np.zeros(len(policy))))
-                return float(share @ worth[self._inside])
+            parts = (self.mdp.transition, self.mdp.reward, self.prior, beta, policy)
+            gains = policy_gains(*parts, np.zeros(len(policy)))
+            if sound and np.isfinite(gains).all() and np.abs(policy.sum(1) - 1).max() <= 2e-15:
+                return float(share @ one_step_worth(*gains)[self._inside])
         return objective(self.mdp, policy, self.prior, beta)
 
     def _chain(self, policy: np.ndarray) -> np.ndarray:

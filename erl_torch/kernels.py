@@ -822,12 +822,8 @@ def gth(p):
             x[k] += x[i] * p[i, k]
         x[: k + 1] /= np.max(x[: k + 1])
     least = np.min(rate)
-    top = 0.0
     for k in range(n):
-        top = max(top, x[k] * (least / rate[k]))
-    for k in range(n):
-        # A component out of range is nothing beside the others, unless its state is slow.
-        sound = sound and (x[k] >= tiny or tiny * (least / rate[k]) < 1e-30 * top)
+        sound = sound and x[k] >= tiny
         x[k] *= least / rate[k]
     return x / np.sum(x), sound and np.isfinite(np.sum(x))
 
@@ -894,7 +890,9 @@ def _soft_maximum(q, weight, beta, choice):
         choice[a] /= summed
     found = top + logarithm / beta
     size = -logarithm if below >= -0.5 else abs(logarithm) + math.log(n)
-    return found, (n + 20) * epsilon * abs(size) / beta + 2.0 * epsilon * abs(found)
+    # The last: products that underflow.
+    rounding = (n + 20) * epsilon * abs(size) / beta + 2.0 * epsilon * abs(found) + (n + 1) * 1e-323 / beta
+    return found, rounding
 
 
 @numba.njit(cache=True, error_model="numpy", nogil=True)

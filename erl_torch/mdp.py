@@ -147,9 +147,9 @@ def normalise_rows(
     sums = np.empty(len(indptr) - 1)
     kernels.row_sums(indptr, data, sums)
     off = np.abs(sums - 1)
-    if not off.max(initial=0.0) > AS_GIVEN:
+    if off.max(initial=0.0) <= AS_GIVEN:  # false for a sum that overflows
         return 0.0
-    bad = np.flatnonzero((off > tolerance) | ~((sums > 0) & np.isfinite(sums)))
+    bad = np.flatnonzero(~(off <= tolerance) | ~((sums > 0) & np.isfinite(sums)))
     if bad.size:
         allowed = "of a finite sum > 0" if np.isinf(tolerance) else f"1 in sum, within {tolerance:g}"
         raise InputError(name(int(bad[0])), f"sum {sums[bad[0]]:.12g}", allowed)

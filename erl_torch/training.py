@@ -807,7 +807,11 @@ def _summary(
         lines.append(f"{'proven':18}{proven(result['theta_bounds'], result['gap'])}")
     if result["data"]:
         fewest = result["data_smallest_visits"]
-        rests = "" if fewest is None else f" (95%; {fewest} visits or more of each pair that counts)"
+        rests = (
+            ""
+            if fewest is None or "no interval" in result["data"]
+            else f" (95%; {fewest} visits or more of each pair that counts)"
+        )
         lines.append(f"{'the data say':18}{result['data']}{rests}")
     if result["n_experience"]:
         rate = done / max(result["seconds_learning"], 1e-3) / 1e6

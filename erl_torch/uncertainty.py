@@ -236,6 +236,9 @@ def _plug_in(model: EmpiricalMDP, part: EmpiricalProblem, policy: np.ndarray, op
     freedom = 2 * total**2 / max(float((weight**2 * spread / n).sum()), 1e-300) if total > 0 else np.inf
     bias = _second_order(model, part, policy, rows, value, optimal)
     untried = _untried(model, part, d) if optimal else 0.0
+    withheld = _withheld(total, third, bias, untried)
+    if withheld:  # a correction that cannot be trusted is none
+        bias = 0.0
     counts = np.flatnonzero(variance > COUNTS * total)
     fewest = int(model.visits.flat[counts].min()) if counts.size else None
     return Estimate(
@@ -249,7 +252,7 @@ def _plug_in(model: EmpiricalMDP, part: EmpiricalProblem, policy: np.ndarray, op
         bias=bias,
         untried=(0.0, untried),
         smallest_visits=fewest,
-        withheld=_withheld(total, third, bias, untried),
+        withheld=withheld,
     )
 
 

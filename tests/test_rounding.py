@@ -18,6 +18,7 @@ from erl_torch import (
     certify,
     iterate_biasing,
     kernels,
+    perron,
     solve_biasing,
     solve_soft_bellman,
 )
@@ -450,3 +451,36 @@ def test_policies_of_single_precision_are_certified_as_their_normalised_rows():
         found = objective(mdp.transition, mdp.reward, prior, 2.0, policy, mdp.start)
         assert mpf(found.low) <= true <= mpf(found.high)
         assert found.high - found.low < 1e-10
+
+
+def test_sums_that_overflow_are_refused():
+    with pytest.raises(InputError, match="row 1"):
+        TabularMDP([[[0.5, 0.5]], [[1e308, 1e308]]], [[0.0], [0.0]])
+    with pytest.raises(InputError, match="finite sum"):
+        TabularMDP([[[0.5, 0.5]], [[1e308, 1e308]]], [[0.0], [0.0]], normalise=True)
+
+
+def test_the_judge_says_what_the_objective_says_off_the_prior_and_of_rough_rows():
+    mdp = random_mdp(np.random.default_rng(8), 4, 2)
+    prior = np.array([[0.5, 0.5]] * 3 + [[1.0, 0.0]])
+    policy = np.full((4, 2), 0.5)
+    assert Judge(mdp, prior, 10).objective(policy, 2.0) == worth(mdp, policy, prior, 2.0) == -np.inf
+    rough = policy * np.array([[1 + 5e-6], [1.0], [1.0], [1.0]])
+    prior = np.full((4, 2), 0.5)
+    assert Judge(mdp, prior, 10).objective(rough, 2.0) == worth(mdp, rough, prior, 2.0)
+
+
+def test_root_of_a_large_matrix_lies_between_its_bounds():
+    """All entries .3: the root is n times the double next to .3."""
+    for n in (10, 1000):
+        low, high = perron(np.full((n, n), 0.3)).bounds
+        assert mpf(low) <= mp.log(mpf(0.3) * n) <= mpf(high)
+
+
+def test_products_that_underflow_are_in_the_bounds():
+    """One state: theta* = -1e-307 log-weight over beta 1e-8, whatever vanishes on the way."""
+    prior = np.array([[1e-307, 1.0]])
+    found = solve_soft_bellman(TabularMDP(np.ones((1, 2, 1)), [[0.0, -1e-9]]), 1e-8, prior)
+    a, b = mpf(prior[0, 0]), mpf(prior[0, 1])
+    theta = -mp.log((a + b * mp.exp(mpf(1e-8) * mpf(-1e-9))) / (a + b)) / mpf(1e-8)
+    assert mpf(found.theta_bounds[0]) <= theta <= mpf(found.theta_bounds[1])

@@ -50,5 +50,6 @@ class NewtonPattern:
         )
         if not converged:
             return None
-        slack = 8 * EPSILON * (1 + np.abs(h).max() + max(abs(low), abs(high)))
+        terms = int(np.diff(e.ptr).max()) + log_weight.shape[1]  # of the sums over successors and actions
+        slack = EPSILON * (terms + 8 * (1 + np.abs(h).max() + max(abs(low), abs(high))))
         return h, (low - slack, high + slack), steps

@@ -107,10 +107,11 @@ def solve_log_perron(
     """(h, bounds on log rho, status, Newton steps) of M exp(h) = rho exp(h); ``elimination`` of its pattern."""
 
     def bounds_of(gain: np.ndarray) -> tuple[float, float]:
-        slack = 8 * np.finfo(np.float64).eps * (1 + np.abs(h).max() + np.abs(gain).max())
+        slack = np.finfo(np.float64).eps * (terms + 8 * (1 + np.abs(h).max() + np.abs(gain).max()))
         return float(gain.min() - slack), float(gain.max() + slack)
 
     backed_up, chain = tilt(h)
+    terms = int(np.diff(chain.indptr).max())  # of a row's sum
     gain = backed_up - h
     for _ in range(power_steps):
         if np.ptp(gain) < 0.1:  # Newton is quadratic from here
