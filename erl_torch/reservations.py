@@ -22,7 +22,7 @@ from scipy.special import rel_entr
 from erl_torch.checks import InputError
 from erl_torch.empirical import EmpiricalMDP, Tally, empirical_mdp, tally
 from erl_torch.mdp import TabularMDP
-from erl_torch.solution import Status
+from erl_torch.solution import Status, proven
 from erl_torch.transitions import Recording, Transitions
 from erl_torch.uncertainty import Estimate
 
@@ -186,7 +186,7 @@ def of_model(
         if low > bounds[1] or high < bounds[0]:
             said.append(
                 f"their theta is {estimate.value:.6g}, standard error {estimate.standard_error:.2g}, "
-                f"the model's in [{bounds[0]:.10g}, {bounds[1]:.10g}]"
+                f"the model's {proven(bounds, None)}"
             )
     if not said:
         return []
