@@ -53,7 +53,7 @@ class TabularMDP:
     normalise: InitVar[bool] = False
 
     def __post_init__(self, normalise: bool) -> None:
-        reward = _dense("reward", self.reward)
+        reward = _dense("reward", self.reward).copy()
         if reward.ndim != 2 or 0 in reward.shape:
             raise InputError("reward", f"array of shape {reward.shape}", "of shape [n_states, n_actions]")
         n_states, n_actions = reward.shape

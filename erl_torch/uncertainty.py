@@ -130,8 +130,15 @@ def theta_uncertainty(model: EmpiricalMDP, beta: float, prior_policy: Any = None
         InputError: beta or prior out of range, or a stream that never returns to any state.
     """
     part = model.problem(beta, prior_policy)
-    policy = solve_problem(part.problem, model, prior_policy).policy.numpy()
-    found = _plug_in(model, part, policy[part.problem.states], optimal=True)
+    solution = solve_problem(part.problem, model, prior_policy)
+    policy = solution.policy.numpy()
+    try:
+        found = _plug_in(model, part, policy[part.problem.states], optimal=True)
+    except SingularChainError:  # the optimum keeps to a part that the process leaves at last, or all but closed parts
+        bounds = solution.theta_bounds
+        assert bounds is not None
+        reason = "the optimal policy's chain falls into parts that double precision cannot join"
+        return Estimate("theta", 0.5 * sum(bounds), np.inf, withheld=reason)
     return replace(
         found,
         name="theta",

@@ -626,3 +626,18 @@ def test_online_refuses_rewards_whose_squares_are_not_finite():
     )
     with pytest.raises(InputError, match="squares"):
         list(EfficientS1().online([data], 1, 1))
+
+
+def test_a_penalty_that_is_never_paid_certifies_nothing_else():
+    """One action costs 1e9: a width of 3 beside theta 1.5 is no certificate, offline or online."""
+    p = np.array([[[0.5, 0.5], [0.0, 1.0]], [[0.1, 0.9], [0.1, 0.9]]])
+    mdp = erl_torch.TabularMDP(p, np.array([[5.0, 10.0], [-2.0, -1e9]]))
+    data = collect(mdp, 100, 1000, 0)
+    rows, reward, _ = oracle.counted(data, 2, 2)
+    best, _ = oracle.soft_optimum(rows, reward, np.full((2, 2), 0.5), 1.0)
+    offline = EfficientS1(1.0).fit(data, 2, 2)
+    if offline.status is Status.CONVERGED:
+        assert offline.theta == pytest.approx(-best, abs=1e-5)
+    *_, online = EfficientS1(1.0).online([data], 2, 2)
+    if online.certified:
+        assert online.theta == pytest.approx(-best, abs=0.2)

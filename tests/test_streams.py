@@ -235,7 +235,7 @@ def test_short_and_damaged_columns(tmp_path):
 
 
 def test_refusals(tmp_path):
-    with pytest.raises(InputError, match=r"none\.npz: must be an npz or Parquet file"):
+    with pytest.raises(InputError, match=r"none\.npz: must be there: an npz or Parquet file"):
         open_recording(tmp_path / "none.npz", 5, 3)
     path = written(tmp_path, PLAIN, "npz")
     with pytest.raises(InputError, match="on_bad=ignore"):

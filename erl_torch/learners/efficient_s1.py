@@ -78,7 +78,7 @@ from typing import Any, ClassVar
 import numpy as np
 import scipy.sparse as sp
 import torch
-from scipy.special import logsumexp
+from scipy.special import logsumexp, softmax
 
 from erl_torch import checks, kernels
 from erl_torch.certificates import soft_backup
@@ -228,11 +228,15 @@ class OnlineState(EfficientState):
         missing = np.where(part.used, 0.0, self.prior_policy.numpy())[part.problem.states].sum(1)
         return np.asarray(self.beta * part.problem.action_value(value) - np.log1p(-missing)[:, None])
 
-    def goal(self, tol: float) -> float:
-        """What the certificate is to be within: .3% of the range of the mean rewards; from 1000 tuples a visited pair
-        on, a share that falls as 1/tuples, like the loss of certainty equivalence, down to ``tol``."""
+    def goal(self, tol: float, policy: np.ndarray) -> float:
+        """What the certificate is to be within: .3% of the range of the mean rewards, or of ten times what ``policy``
+        [S, A] meets of them in the states as visited, if less; from 1000 tuples a visited pair on, a share that falls
+        as 1/tuples, like the loss of certainty equivalence, down to ``tol``."""
         reward = self.reward[self.visits > 0]
         span = float(np.ptp(reward)) or float(np.abs(reward).max()) or 1.0
+        share = self.visits.reshape(policy.shape).sum(1) / self.visits.sum()
+        met = float(share @ (policy * np.abs(self.reward.reshape(policy.shape))).sum(1))
+        span = min(span, 10 * met) if met > 0 else span
         return span * max(tol, min(0.003, 3 * len(reward) / self.n_tuples))
 
     def metrics(self) -> dict[str, float]:
@@ -533,7 +537,7 @@ class EfficientS1:
         )
         low, high = certificate(stream.part, after.log_psi.numpy(), after.policy.numpy())
         width = high - low
-        certified = self.certificate and width <= self.tol * stream.part.problem.reward_range
+        certified = self.certificate and is_narrow(stream.part, (-high, -low), self.tol, after.policy.numpy())
         return replace(after, empirical_width=width, certified=certified)
 
     def init_online(self, n_states: int, n_actions: int) -> OnlineState:
@@ -753,7 +757,9 @@ class EfficientS1:
         if part is not None:
             problem, inside = part.problem, part.problem.states
             sweeps = math.ceil(SWEPT_PER_TUPLE * state.n_tuples / problem.transition.nnz)
-            found, gain, needed = swept(problem, value[inside], state.goal(self.tol), sweeps)
+            with np.errstate(divide="ignore"):
+                policy = softmax(np.log(weight) + log_z, axis=1)
+            found, gain, needed = swept(problem, value[inside], state.goal(self.tol, policy), sweeps)
             low, high = float(gain.min()), float(gain.max())
             log_rho = float(np.clip(log_rho, self.beta * low, self.beta * high))
             if needed:
@@ -781,7 +787,7 @@ class EfficientS1:
             return state
         problem, inside = part.problem, part.problem.states
         weight = state.prior_policy.numpy() * (part.used | ~part.used.any(1, keepdims=True))
-        log_psi, goal = state.log_psi_in_use.numpy(), state.goal(self.tol)
+        log_psi = state.log_psi_in_use.numpy()
 
         def judged(log_z: np.ndarray) -> tuple[float, float, np.ndarray, np.ndarray]:
             """(the certificate's two ends, z, log psi of line 12)."""
@@ -794,6 +800,8 @@ class EfficientS1:
         log_z = np.zeros_like(weight)
         log_z[inside] = state.log_z.numpy()[inside]
         low, high, log_average, line_12 = judged(log_z)
+        with np.errstate(divide="ignore"):
+            goal = state.goal(self.tol, softmax(np.log(weight) + log_average, axis=1))
         if not high - low <= goal:
             value, *_ = swept(problem, state.value[inside], goal, STATE_SWEEPS)
             log_z[inside] = state.backed_up(part, value) - self.beta * state.value[inside, None]
@@ -850,6 +858,12 @@ def certificate(part: EmpiricalProblem, log_psi: np.ndarray, policy: np.ndarray)
     prior = np.where(inside > 0, problem.prior, 1.0)
     followed = (inside * q).sum(1) - kl_per_state(inside, prior) / problem.beta
     return float((followed - value).min()), float((backed_up - value).max())
+
+
+def is_narrow(part: EmpiricalProblem, bounds: tuple[float, float], tol: float, policy: np.ndarray) -> bool:
+    """``Problem.is_narrow`` for a policy [S, A] on all states."""
+    inside = np.where(part.used, policy, 0.0)[part.problem.states]
+    return part.problem.is_narrow(bounds, tol, inside / inside.sum(1, keepdims=True))
 
 
 def swept(problem: Problem, value: np.ndarray, goal: float, sweeps: int) -> tuple[np.ndarray, np.ndarray, int]:
