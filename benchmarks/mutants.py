@@ -906,8 +906,8 @@ MUTANTS = [
     Mutant(
         "lost digits of an elimination are trusted",
         "kernels.py",
-        "sound = sound and (x[k] >= tiny or tiny * (least / rate[k]) < 1e-30 * top)",
-        "sound = True",
+        "        sound = sound and x[k] >= tiny\n",
+        "        sound = True\n",
         "test_rounding.py::test_digits_lost_below_the_range_of_numbers_are_known",
     ),
     Mutant(
@@ -920,8 +920,8 @@ MUTANTS = [
     Mutant(
         "a gain's error has no rounding of the logarithm",
         "kernels.py",
-        "    return found, (n + 20) * epsilon * abs(size) / beta + 2.0 * epsilon * abs(found)",
-        "    return found, 0.0",
+        "    return found, rounding\n",
+        "    return found, 0.0\n",
         "test_rounding.py::test_gains_lie_between_their_ends",
     ),
     Mutant(
@@ -1004,8 +1004,8 @@ MUTANTS = [
     Mutant(
         "tolerance relative to rewards never met",
         "solvers/problem.py",
-        "        return min(self.reward_range, seen)",
-        "        return self.reward_range",
+        "        return seen\n",
+        "        return self.reward_range\n",
         "test_rounding.py::test_a_penalty_that_is_never_paid_loosens_nothing",
     ),
     Mutant(

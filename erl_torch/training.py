@@ -220,7 +220,7 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
     seconds = time.perf_counter() - began
     result = _result(cfg, solution, last, run.n_experience, clock.seconds, seconds)
     result["data"] = None if estimate is None else str(estimate)
-    result["data_smallest_visits"] = None if estimate is None else estimate.smallest_visits
+    result["data_smallest_visits"] = None if estimate is None or estimate.withheld else estimate.smallest_visits
     result["n_skipped"] = run.n_skipped
     result["notes"] = notes
     write_json(directory / "result.json", result)
@@ -807,11 +807,7 @@ def _summary(
         lines.append(f"{'proven':18}{proven(result['theta_bounds'], result['gap'])}")
     if result["data"]:
         fewest = result["data_smallest_visits"]
-        rests = (
-            ""
-            if fewest is None or "no interval" in result["data"]
-            else f" (95%; {fewest} visits or more of each pair that counts)"
-        )
+        rests = "" if fewest is None else f" (95%; {fewest} visits or more of each pair that counts)"
         lines.append(f"{'the data say':18}{result['data']}{rests}")
     if result["n_experience"]:
         rate = done / max(result["seconds_learning"], 1e-3) / 1e6

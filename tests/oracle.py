@@ -58,9 +58,7 @@ def stationary(chain):
 
 def worth(p, r, prior, beta, policy):
     """J(policy): reward rate less KL to the prior over beta, where the policy's chain has one closed class."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        kl = np.where(policy > 0, policy * np.log(policy / prior), 0.0).sum(1)
-    return stationary(np.einsum("sa,sat->st", policy, p)) @ ((policy * r).sum(1) - kl / beta)
+    return soft_rate(p, r, prior, beta, policy)[0]
 
 
 class Lines9To11(NamedTuple):

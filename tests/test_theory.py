@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import random_policy
+from oracle import stationary
 
 RNG_SEEDS = range(12)
 
@@ -61,12 +62,6 @@ def perron(m):
 def kl(policy, other):
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(policy > 0, policy * np.log(policy / other), 0.0).sum(1)
-
-
-def stationary(chain):
-    """Of an irreducible chain."""
-    n = len(chain)
-    return np.linalg.lstsq(np.vstack([chain.T - np.eye(n), np.ones(n)]), np.eye(n + 1)[n], rcond=None)[0]
 
 
 def sparse_problem(seed, periodic=False, beta=None):

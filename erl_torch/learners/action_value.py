@@ -40,7 +40,7 @@ import torch
 from erl_torch import checks, kernels
 from erl_torch.checks import InputError
 from erl_torch.learners.fitting import NonFiniteError, columns, epochs, run_to_end
-from erl_torch.mdp import check_policy
+from erl_torch.mdp import check_prior
 from erl_torch.solution import Solution, Status
 from erl_torch.transitions import Parts, Recording, Transitions
 
@@ -173,10 +173,7 @@ class ActionValueLearner:
 
     def init(self, n_states: int, n_actions: int) -> ActionValueState:
         """The state before any tuple: q = 0, the prior policy."""
-        prior = check_policy("prior_policy", self.prior_policy, n_states, n_actions)
-        if not (prior > 0).all():
-            s, a = np.argwhere(prior <= 0)[0]
-            raise InputError(f"prior_policy[{s}, {a}]", prior[s, a], "> 0 (leave the action out instead)")
+        prior = check_prior("prior_policy", self.prior_policy, n_states, n_actions)
         return ActionValueState(
             epoch=0,
             n_tuples=0,

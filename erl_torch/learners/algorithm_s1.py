@@ -75,7 +75,7 @@ from erl_torch.checks import InputError
 from erl_torch.empirical import tally
 from erl_torch.learners import listing
 from erl_torch.learners.fitting import NonFiniteError, columns, epochs, run_to_end
-from erl_torch.mdp import check_policy
+from erl_torch.mdp import check_prior
 from erl_torch.solution import Solution, Status
 from erl_torch.transitions import Parts, Recording, Transitions, tuple_at
 
@@ -293,10 +293,7 @@ class AlgorithmS1:
 
     def init(self, n_states: int, n_actions: int) -> S1State:
         """The state before any tuple (line 1): the prior policy, rho = exp(-beta), no bias."""
-        prior = check_policy("prior_policy", self.prior_policy, n_states, n_actions)
-        if not (prior > 0).all():
-            s, a = np.argwhere(prior <= 0)[0]
-            raise InputError(f"prior_policy[{s}, {a}]", prior[s, a], "> 0 (leave the action out instead)")
+        prior = check_prior("prior_policy", self.prior_policy, n_states, n_actions)
         rho = math.exp(-self.beta)
         if rho == 0.0:
             raise InputError("beta", self.beta, "below 745, where exp(-beta) leaves double precision")

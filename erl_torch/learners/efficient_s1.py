@@ -87,7 +87,7 @@ from erl_torch.empirical import EmpiricalMDP, EmpiricalProblem, empirical_mdp, t
 from erl_torch.evaluation import kl_per_state
 from erl_torch.learners.algorithm_s1 import BLOCK, LOG_PSI_EPSILON
 from erl_torch.learners.fitting import NonFiniteError, columns, epochs, run_to_end
-from erl_torch.mdp import check_policy
+from erl_torch.mdp import check_prior
 from erl_torch.solution import Solution, Status
 from erl_torch.solvers.problem import Problem
 from erl_torch.transitions import Parts, Recording, Selection, Transitions
@@ -427,11 +427,7 @@ class EfficientS1:
 
     def init(self, n_states: int, n_actions: int) -> EfficientState:
         """The state before any tuple: the prior policy, rho = exp(-beta), no bias."""
-        prior_table = check_policy("prior_policy", self.prior_policy, n_states, n_actions)
-        if not (prior_table > 0).all():
-            s, a = np.argwhere(prior_table <= 0)[0]
-            raise InputError(f"prior_policy[{s}, {a}]", prior_table[s, a], "> 0 (leave the action out instead)")
-        prior = torch.from_numpy(prior_table)
+        prior = torch.from_numpy(check_prior("prior_policy", self.prior_policy, n_states, n_actions))
         zero, none = torch.zeros_like(prior), torch.zeros(n_states, dtype=torch.float64)
         return EfficientState(
             bias_iteration=0,
@@ -456,7 +452,7 @@ class EfficientS1:
         found = tally(data, n_states, n_actions, lr_psi)
         model = empirical_mdp(data, n_states, n_actions, found)
         part = model.problem(self.beta, self.prior_policy)
-        prior = check_policy("prior_policy", self.prior_policy, n_states, n_actions)
+        prior = check_prior("prior_policy", self.prior_policy, n_states, n_actions)
         weight = prior
         if self.unvisited == "exclude":
             inside = np.asarray(part.used.any(1))
@@ -851,8 +847,7 @@ def certificate(part: EmpiricalProblem, log_psi: np.ndarray, policy: np.ndarray)
     """
     problem = part.problem
     value = -log_psi[problem.states] / problem.beta
-    inside = np.where(part.used, policy, 0.0)[problem.states]
-    inside /= inside.sum(1, keepdims=True)
+    inside = within(part, policy)
     q = problem.action_value(value)
     backed_up, _ = soft_backup(q, problem.prior, problem.beta)
     prior = np.where(inside > 0, problem.prior, 1.0)
@@ -862,8 +857,13 @@ def certificate(part: EmpiricalProblem, log_psi: np.ndarray, policy: np.ndarray)
 
 def is_narrow(part: EmpiricalProblem, bounds: tuple[float, float], tol: float, policy: np.ndarray) -> bool:
     """``Problem.is_narrow`` for a policy [S, A] on all states."""
+    return part.problem.is_narrow(bounds, tol, within(part, policy))
+
+
+def within(part: EmpiricalProblem, policy: np.ndarray) -> np.ndarray:
+    """``policy`` [S, A] on the pairs that take part, [n, A], normalised."""
     inside = np.where(part.used, policy, 0.0)[part.problem.states]
-    return part.problem.is_narrow(bounds, tol, inside / inside.sum(1, keepdims=True))
+    return np.asarray(inside / inside.sum(1, keepdims=True))
 
 
 def swept(problem: Problem, value: np.ndarray, goal: float, sweeps: int) -> tuple[np.ndarray, np.ndarray, int]:

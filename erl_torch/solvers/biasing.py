@@ -158,9 +158,10 @@ def _iterate(problem: Problem, ref: int, known: Problem | None, max_steps: int) 
             kl = _kl_to(problem, at, tilted)
         new = value + h / beta
         new -= new[ref]
-        if k and not np.isfinite(new).all():  # the eigenvector was lost: the value of before is the last
+        if np.isfinite(new).all():
+            value = new
+        elif k:  # the eigenvector was lost: the value of before is the last
             return
-        value = new if np.isfinite(new).all() else value
         proven = problem.gains(value)
         lower, upper = max(lower, proven.theta_bounds[0]), min(upper, proven.theta_bounds[1])
         yield BiasingState(

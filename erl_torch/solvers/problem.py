@@ -60,8 +60,8 @@ class Problem:
 
     def scale_seen(self, policy: np.ndarray, bounds: tuple[float, float]) -> float:
         """What tolerances are relative to, reward a step: max(|theta|, mean |r| that ``policy`` [n, A] meets in the
-        long run), but not above the reward range; rewards that it never meets do not count. Where both are 0 (or theta
-        may be, by its ``bounds``), the smallest |r| that is not."""
+        long run); rewards that it never meets do not count. Where both are 0 (or theta may be, by its ``bounds``), the
+        smallest |r| that is not."""
         if np.ptp(self.reward) == 0:
             return self.reward_range
         seen = max(bounds[0], -bounds[1], 0.0)
@@ -72,7 +72,7 @@ class Problem:
         if not seen > 0:
             size = np.abs(self.reward)
             seen = float(size[size > 0].min(initial=np.inf))
-        return min(self.reward_range, seen)
+        return seen
 
     def is_narrow(self, bounds: tuple[float, float], tol: float, policy: np.ndarray) -> bool:
         """Whether bounds on theta* are as narrow as ``tol`` asks, relative to what the policy behind them sees."""
