@@ -1257,7 +1257,7 @@ def merge_log_weights(indptr, log_p, log_weight, slot, ptr, log_m):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _gains(ptr, ind, log_m, h, gain, chain):
+def log_gains(ptr, ind, log_m, h, gain, chain):
     """Fills gain = log(M exp(h)) - h [n] and chain, its row-stochastic derivative; returns min and max of the gains."""
     low, high = np.inf, -np.inf
     for s in range(h.size):
@@ -1275,6 +1275,23 @@ def _gains(ptr, ind, log_m, h, gain, chain):
         if not np.isfinite(gain[s]):  # min and max would pass over it
             return -np.inf, np.inf
         low, high = min(low, gain[s]), max(high, gain[s])
+    return low, high
+
+
+@numba.njit(cache=True, error_model="numpy")
+def lazy_log_steps(ptr, ind, log_m, h, gain, chain, steps, near):
+    """Power steps on exp(h) in logarithms, averaged with standing still (no period can catch them), until the gains
+    differ by less than ``near`` or there were ``steps``. h changes in place; gain, chain and what is returned are those
+    of ``log_gains`` there."""
+    low, high = log_gains(ptr, ind, log_m, h, gain, chain)
+    for _ in range(steps):
+        if high - low < near or not np.isfinite(high - low):
+            break
+        mean = np.mean(gain)
+        for s in range(h.size):
+            h[s] += max(gain[s], mean) + math.log1p(math.exp(-abs(gain[s] - mean)))
+        h -= np.max(h)
+        low, high = log_gains(ptr, ind, log_m, h, gain, chain)
     return low, high
 
 
@@ -1332,15 +1349,7 @@ def newton_perron(
     epsilon = 2.0**-52
     if _lazy_steps(ptr, ind, log_m, h, power_steps):
         log_power_steps = 0
-    a, b = _gains(ptr, ind, log_m, h, gain, chain)
-    for _ in range(log_power_steps):
-        if b - a < 0.1:  # Newton is quadratic from here
-            break
-        mean = np.mean(gain)
-        for s in range(n):
-            h[s] += max(gain[s], mean) + math.log1p(math.exp(-abs(gain[s] - mean)))
-        h -= np.max(h)
-        a, b = _gains(ptr, ind, log_m, h, gain, chain)
+    a, b = lazy_log_steps(ptr, ind, log_m, h, gain, chain, log_power_steps, 0.1)  # Newton is quadratic from there
     factored = False
     before = np.inf
     for step in range(max_steps + 1):
@@ -1387,11 +1396,11 @@ def newton_perron(
             for s in range(n):
                 new[s] = h[s] + x[rank[s]] - common * hitting[rank[s]]
             new -= np.max(new)
-            new_a, new_b = _gains(ptr, ind, log_m, new, x, chain)
+            new_a, new_b = log_gains(ptr, ind, log_m, new, x, chain)
             if fresh or new_b - new_a < 0.25 * spread:
                 break
             # The old factors no longer do.
-            _gains(ptr, ind, log_m, h, gain, chain)
+            log_gains(ptr, ind, log_m, h, gain, chain)
             factored = False
         a, b = new_a, new_b
         h[:] = new

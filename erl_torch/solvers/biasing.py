@@ -24,9 +24,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
 
-from erl_torch import checks
+from erl_torch import checks, kernels
 from erl_torch.certificates import soft_backup
 from erl_torch.checks import InputError
 from erl_torch.mdp import TabularMDP
@@ -40,6 +39,7 @@ from erl_torch.solvers.soft_bellman import polish
 KL_TOLERANCE = 1e-6
 RTOL = 1e-13  # spread of the bounds on an eigenvalue
 MAX_NEWTON_STEPS = 60
+PATIENCE = 5  # iterations without an eigenvector in which the bounds do not halve
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,20 +80,22 @@ def solve_biasing(
     Returns:
         A Solution with ``k`` (None if the KL test never held) and the certificate, which the last value carries after
         a few Newton steps where its rounding alone keeps the bounds apart. Status REDUCIBLE, and no theta,
-        where the states that the start leads to are not one class: the eigenvector needs that
-        (``solve_soft_bellman`` needs less, and the message says where it will do).
+        where the states that the start leads to are not one class, with ``target`` in both: the eigenvector needs
+        that (``solve_soft_bellman`` needs less, and the message says where it will do).
 
     Raises:
         InputError: an argument out of range, or a target of another shape.
     """
     checks.one_of("stop", stop, ("certificate", "kl"))
     checks.positive("tol", tol)
-    problem = _problem(mdp, beta, prior_policy, target)
-    if len(problem.classes[1]) > 1:
+    problem, known = _problems(mdp, beta, prior_policy, target)
+    message = _no_eigenvector(problem, known)
+    if message:
         found = reducible_solution(target or mdp, problem, prior_policy)
-        if problem.classes[1].sum() > 1:
-            return found
-        return replace(found, message=f"{found.message}. Soft policy iteration needs one closed set only")
+        if problem.regeneration_state() is not None:
+            message += ". Soft policy iteration needs one closed set only"
+            message += "" if known is None else ", of target's"
+        return replace(found, message=message)
     k: int | None = None
     state: BiasingState | None = None
     for state in iterate_biasing(mdp, beta, prior_policy, target, max_steps):
@@ -127,15 +129,15 @@ def iterate_biasing(
         max_steps: biasing iterations at most.
 
     Raises:
-        InputError: an argument out of range, a target of another shape, or an MDP whose start leads to states that
-            are not one class.
+        InputError: an argument out of range, a target of another shape, or an MDP (``mdp`` or ``target``) whose start
+            leads to states that are not one class.
     """
-    problem = _problem(mdp, beta, prior_policy, target)
+    problem, known = _problems(mdp, beta, prior_policy, target)
     checks.at_least("max_steps", max_steps, 1)
-    ref = problem.regeneration_state()
-    if ref is None or len(problem.classes[1]) > 1:
-        raise InputError("mdp", explain_classes(problem), "one class of states, for an eigenvector")
-    return _iterate(problem, ref, None if target is None else Problem.of(mdp, beta, prior_policy), max_steps)
+    message, ref = _no_eigenvector(problem, known), problem.regeneration_state()
+    if message or ref is None:
+        raise InputError("mdp", message, "one class of states, for an eigenvector")
+    return _iterate(problem, ref, known, max_steps)
 
 
 def _iterate(problem: Problem, ref: int, known: Problem | None, max_steps: int) -> Iterator[BiasingState]:
@@ -145,7 +147,8 @@ def _iterate(problem: Problem, ref: int, known: Problem | None, max_steps: int) 
     known_pattern = pattern if known is None else NewtonPattern.of(known)
     value = np.zeros(problem.n_states)
     lower, upper = -np.inf, np.inf
-    shift_before = np.inf
+    shift_before = width = np.inf
+    lost = 0
     for k in range(max_steps):
         at, its_pattern = (known or problem, known_pattern) if k == 0 else (problem, pattern)
         h, bounds, status, newton_steps = _eigenvector(at, value, its_pattern, ref)
@@ -180,17 +183,36 @@ def _iterate(problem: Problem, ref: int, known: Problem | None, max_steps: int) 
         if shift <= 1e-13 * (1 + np.abs(beta * value).max()) and shift >= 0.5 * shift_before:
             return
         shift_before = shift
+        # Where the eigenvector is beyond double precision, the value runs away and proves nothing more.
+        lost += 1
+        if status is Status.CONVERGED or upper - lower < 0.5 * width:
+            lost, width = 0, upper - lower
+        if lost == PATIENCE:
+            return
 
 
-def _problem(mdp: TabularMDP, beta: float, prior_policy: Any, target: TabularMDP | None) -> Problem:
+def _problems(
+    mdp: TabularMDP, beta: float, prior_policy: Any, target: TabularMDP | None
+) -> tuple[Problem, Problem | None]:
+    """(what is to be solved, what is known of it before, if that is another)."""
+    known = Problem.of(mdp, beta, prior_policy)
     if target is None:
-        return Problem.of(mdp, beta, prior_policy)
+        return known, None
     if target.reward.shape != mdp.reward.shape:
         raise InputError("target", f"MDP of shape {target.reward.shape}", f"of the shape of mdp, {mdp.reward.shape}")
-    problem, known = Problem.of(target, beta, prior_policy), Problem.of(mdp, beta, prior_policy)
+    problem = Problem.of(target, beta, prior_policy)
     if not np.array_equal(problem.states, known.states):
         raise InputError("target", "MDP", "one whose start leads to the same states as that of mdp")
-    return problem
+    return problem, known
+
+
+def _no_eigenvector(problem: Problem, known: Problem | None) -> str:
+    """Why one of the two has no eigenvector that is positive everywhere; empty where both have."""
+    if len(problem.classes[1]) > 1:
+        return explain_classes(problem)
+    if known is not None and len(known.classes[1]) > 1:
+        return f"known before, beside target: {explain_classes(known)}"
+    return ""
 
 
 def _eigenvector(
@@ -204,13 +226,12 @@ def _eigenvector(
             h, bounds, steps = found
             return h, bounds, Status.CONVERGED, steps
 
-    def tilt(h: np.ndarray) -> tuple[np.ndarray, sp.csr_array]:
-        log_mean, _, tilted = problem.tilt(h)
-        backed_up, choice = soft_backup(log_weight + log_mean.reshape(log_weight.shape), problem.prior, 1.0)
-        return backed_up, problem.chain(choice, tilted)
-
+    ptr, ind, slot = problem.pattern
+    log_m, p = np.empty(len(ind)), problem.transition
+    kernels.merge_log_weights(p.indptr, np.log(p.data), log_weight + np.log(problem.prior), slot, ptr, log_m)
     start = np.zeros(problem.n_states)
-    return solve_log_perron(tilt, start, RTOL, MAX_NEWTON_STEPS, elimination=problem.elimination)
+    terms = int(np.diff(ptr).max()) + problem.n_actions
+    return solve_log_perron(ptr, ind, log_m, start, RTOL, MAX_NEWTON_STEPS, terms, elimination=problem.elimination)
 
 
 def _kl_to(problem: Problem, at: Problem, tilted: np.ndarray) -> np.ndarray:

@@ -9,7 +9,6 @@ residual norm would say nothing about small components.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,14 +17,15 @@ import scipy.sparse as sp
 import torch
 
 from erl_torch import kernels
-from erl_torch.chains import Elimination, RegenerativeLU, SingularChainError, classes, likely_state
+from erl_torch.chains import EPSILON, Elimination, RegenerativeLU, SingularChainError, classes, likely_state
 from erl_torch.checks import InputError
 from erl_torch.solution import Status
 
 POWER_STEPS = 300  # cheap ones, on the matrix itself
 LOG_POWER_STEPS = 40
-# (F(h), derivative K as a row-stochastic CSR) at h
-Tilt = Callable[[np.ndarray], tuple[np.ndarray, sp.csr_array]]
+REFUSALS = 5  # chains that fall apart, each followed by more power steps
+STEPS_AFTER_A_REFUSAL = 200
+NEAR = 0.1  # difference of the gains F(h) - h from where Newton is quadratic
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,92 +82,93 @@ def perron(matrix: Any, rtol: float = 1e-13, max_steps: int = 60) -> PerronPair:
         message = f"{len(sizes)} classes of states, the first begin with {shown}: solve each apart"
         nothing = torch.full((n,), torch.nan, dtype=torch.float64)
         return PerronPair(np.nan, nothing, (-np.inf, np.inf), Status.REDUCIBLE, 0, message)
-    log_mean, kl, tilted = np.empty(n), np.empty(n), np.empty(m.nnz)
-
-    def tilt(h: np.ndarray) -> tuple[np.ndarray, sp.csr_array]:
-        kernels.tilt_rows(m.indptr, m.indices, m.data, h, log_mean, kl, tilted)
-        return log_mean.copy(), sp.csr_array((tilted.copy(), m.indices, m.indptr), shape=m.shape)
-
     y = np.ones(n)
     kernels.lazy_power(m.indptr, m.indices, m.data, y, POWER_STEPS)
     start = np.log(y) if np.isfinite(y).all() and y.min() > 1e-280 else np.zeros(n)
-    h, bounds, status, n_steps = solve_log_perron(tilt, start, rtol, max_steps, 0)
+    ptr, ind, terms = m.indptr.astype(np.int64), m.indices.astype(np.int32), int(np.diff(m.indptr).max())
+    h, bounds, status, n_steps = solve_log_perron(ptr, ind, np.log(m.data), start, rtol, max_steps, terms, 0)
     h -= h.max()
     return PerronPair(0.5 * sum(bounds), torch.from_numpy(h), bounds, status, n_steps)
 
 
 def solve_log_perron(
-    tilt: Tilt,
-    h: np.ndarray,
+    ptr: np.ndarray,
+    ind: np.ndarray,
+    log_m: np.ndarray,
+    start: np.ndarray,
     rtol: float,
     max_steps: int,
+    terms: int,
     power_steps: int = LOG_POWER_STEPS,
     elimination: Elimination | None = None,
 ) -> tuple[np.ndarray, tuple[float, float], Status, int]:
-    """(h, bounds on log rho, status, Newton steps) of M exp(h) = rho exp(h); ``elimination`` of its pattern."""
+    """(h [n], bounds on log rho, status, Newton steps) of M exp(h) = rho exp(h), for M = exp(log_m) as CSR (ptr, ind).
 
-    def bounds_of(gain: np.ndarray) -> tuple[float, float]:
-        slack = np.finfo(np.float64).eps * (terms + 8 * (1 + np.abs(h).max() + np.abs(gain).max()))
-        return float(gain.min() - slack), float(gain.max() + slack)
+    ``start`` [n]; ``terms`` of the longest row, also those that were summed on the way to log_m; ``elimination`` of the
+    pattern, where it is known already.
+    """
 
-    backed_up, chain = tilt(h)
-    terms = int(np.diff(chain.indptr).max())  # of a row's sum
-    gain = backed_up - h
-    for _ in range(power_steps):
-        if np.ptp(gain) < 0.1:  # Newton is quadratic from here
-            break
-        h = _half_step(h, backed_up)
-        backed_up, chain = tilt(h)
-        gain = backed_up - h
-    ref = likely_state(chain)
-    best, best_bounds = h, bounds_of(gain)
+    def power(h: np.ndarray, steps: int, near: float) -> _Point:
+        h, gain, chain = h.copy(), np.full(len(h), np.nan), np.full(len(ind), np.nan)
+        kernels.lazy_log_steps(ptr, ind, log_m, h, gain, chain, steps, near)
+        return _Point(h, gain, sp.csr_array((chain, ind, ptr), shape=(len(h), len(h))))
+
+    def newton(at: _Point, lu: RegenerativeLU) -> _Point:
+        new = at.h + lu.poisson(at.gain)[1]
+        return power(new - new.max(), 0, 0.0)
+
+    at = power(start, power_steps, NEAR)
+    ref = likely_state(at.chain)
+    best = at
     refused, before = 0, np.inf
     lu: RegenerativeLU | None = None
-    elimination = elimination or Elimination.of(chain.indptr, chain.indices)
+    elimination = elimination or Elimination.of(ptr, ind)
     for step in range(max_steps + 1):
-        spread = np.ptp(gain)
-        rounding = 64 * np.finfo(np.float64).eps * (1 + np.abs(h).max() + np.abs(gain).max())
+        spread, rounding = at.spread, 64 * EPSILON * at.size
         if rounding < 0.1 and spread <= max(rtol, rounding if spread > 0.25 * before else 0.0):
-            return h, bounds_of(gain), Status.CONVERGED, step
+            return at.h, at.bounds(terms), Status.CONVERGED, step
         if step == max_steps:
             break
         try:
-            new, (new_backed_up, new_chain) = _step(tilt, h, gain, lu) if lu else (h, (backed_up, chain))
-            new_gain = new_backed_up - new
+            new = newton(at, lu) if lu else at
             # The factors of an earlier step will do where they still gain two digits.
-            if lu is None or not np.ptp(new_gain) < 1e-2 * spread:
-                lu = RegenerativeLU.adapted(chain, ref, elimination)
+            if lu is None or not new.spread < 1e-2 * spread:
+                lu = RegenerativeLU.adapted(at.chain, ref, elimination)
                 ref = lu.ref
-                new, (new_backed_up, new_chain) = _step(tilt, h, gain, lu)
-                new_gain = new_backed_up - new
-            if not np.isfinite(new_gain).all():
+                new = newton(at, lu)
+            if not np.isfinite(new.gain).all():
                 raise SingularChainError("not finite")
         except SingularChainError:
             refused, lu = refused + 1, None
-            if refused > 5:
-                return best, best_bounds, Status.STAGNATED, step
-            for _ in range(200):
-                h = _half_step(h, backed_up)
-                backed_up, chain = tilt(h)
-            gain = backed_up - h
-            before = np.inf
+            if refused > REFUSALS:
+                return best.h, best.bounds(terms), Status.STAGNATED, step
+            at, before = power(at.h, STEPS_AFTER_A_REFUSAL, 0.0), np.inf
             continue
-        before = spread
-        h, backed_up, chain, gain = new, new_backed_up, new_chain, new_gain
-        if np.ptp(gain) < best_bounds[1] - best_bounds[0]:
-            best, best_bounds = h, bounds_of(gain)
-    return best, best_bounds, Status.STEP_LIMIT, max_steps
+        before, at = spread, new
+        if at.spread < best.spread:
+            best = at
+    return best.h, best.bounds(terms), Status.STEP_LIMIT, max_steps
 
 
-def _step(
-    tilt: Tilt, h: np.ndarray, gain: np.ndarray, lu: RegenerativeLU
-) -> tuple[np.ndarray, tuple[np.ndarray, sp.csr_array]]:
-    new = h + lu.poisson(gain)[1]
-    new -= new.max()
-    return new, tilt(new)
+@dataclass(frozen=True, eq=False)
+class _Point:
+    """An h with its gains F(h) - h and the derivative of F, a row-stochastic CSR."""
 
+    h: np.ndarray  # [n]
+    gain: np.ndarray  # [n]
+    chain: sp.csr_array
 
-def _half_step(h: np.ndarray, backed_up: np.ndarray) -> np.ndarray:
-    """A power step averaged with standing still: no period can catch it."""
-    new = np.logaddexp(h + (backed_up - h).mean(), backed_up)
-    return np.asarray(new - new.max())
+    @property
+    def spread(self) -> float:
+        return float(np.ptp(self.gain))
+
+    @property
+    def size(self) -> float:
+        return float(1 + np.abs(self.h).max() + np.abs(self.gain).max())
+
+    def bounds(self, terms: int) -> tuple[float, float]:
+        """On log rho; ``terms`` of the longest row."""
+        if not np.isfinite(self.gain).all():
+            return -np.inf, np.inf
+        slack = EPSILON * (terms + 8 * self.size)
+        return float(self.gain.min() - slack), float(self.gain.max() + slack)
