@@ -5,7 +5,7 @@
     python benchmarks/adversarial.py before=TREE ...         beside the package of another tree (or its `to=` FILE)
     python benchmarks/adversarial.py from=FILE.jsonl ...     tables of an earlier run
 
-Each problem: both solvers, and ``certify`` of a random, a greedy and a stay-put policy. They run in processes of their
+Each problem: both solvers, and ``certify`` of the policies of ``many_digits.policies``. They run in processes of their
 own, so that one that dies is counted, named, and left out.
 """
 
@@ -45,6 +45,7 @@ except ImportError:  # an earlier package
 SOLVERS = {"soft policy iteration": solve_soft_bellman, "biasing": partial(solve_biasing, max_steps=50)}
 TOL = 1e-10  # of the solvers, by default
 ORACLE_SECONDS = 60
+COUNTED = ("problems", "violations", "died", "no oracle", "infinite bounds", "no gap")  # columns
 
 
 class TooLongError(ArithmeticError):
@@ -58,7 +59,7 @@ def _too_long(*_: Any) -> None:
 def examine(given: Given, seed: int, certifying: bool = True) -> dict[str, Any]:
     """Statuses, seconds and violations of one problem; ``certifying``: gaps and objectives too."""
     warnings.simplefilter("ignore")
-    out: dict[str, Any] = {"kind": given.kind, "size": list(given.reward.shape), "wrong": []}
+    out: dict[str, Any] = {"kind": given.kind, "size": list(given.reward.shape), "wrong": [], "infinite": 0, "none": 0}
     oracle = Oracle(given)
     found = {}
     tick = time.process_time()
@@ -91,6 +92,7 @@ def examine(given: Given, seed: int, certifying: bool = True) -> dict[str, Any]:
         signal.signal(signal.SIGALRM, handler)
     out["oracle_seconds"] = time.process_time() - tick
     for name, solution in found.items():
+        out["infinite"] += not np.isfinite(solution.theta_bounds).all()
         check_solution(out, name, solution, rate)
         if certifying:
             check_gap(out, f"gap of {name}", solution, rate, oracle.worth(solution.policy.numpy()))
@@ -131,6 +133,7 @@ def check_solution(out: dict[str, Any], name: str, solution: Any, rate: Rate) ->
 
 def check_gap(out: dict[str, Any], where: str, solution: Any, rate: Rate, worth: mpf) -> None:
     if solution.gap is None:
+        out["none"] += 1
         return
     short = rate.start_low - worth - mpf(solution.gap) if np.isfinite(solution.gap) else mpf(0)
     if np.isnan(solution.gap):
@@ -156,6 +159,7 @@ def certified(out: dict[str, Any], oracle: Oracle, mdp: TabularMDP, rate: Rate, 
             if certificates is None:
                 continue
             j = certificates.objective(mdp.transition, mdp.reward, total, given.beta, policy, mdp.start)
+            out["infinite"] += not np.isfinite([j.low, j.high]).all()
             size = max(mpf(j.low) - worth, worth - mpf(j.high))
             if size > oracle.rounding:
                 _wrong(out, f"objective of {name}", f"{j} leaves out {mp.nstr(worth, 17)}", size)
@@ -231,8 +235,9 @@ def run(seed: int, n: int, workers: int, tree: str, certifying: bool, to: Path |
 
 
 def count(records: list[dict[str, Any]], old: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """By kind: problems, violations, statuses of each solver, CONVERGED before and now."""
+    """By kind: problems, violations, statuses of each solver, CONVERGED before and now on the problems of ``old``."""
     table: dict[str, dict[str, Any]] = {}
+    both = {r["number"] for r in old}
     for kind in [make.__name__ for make in KINDS]:
         of_kind = [r for r in records if r["kind"] == kind]
         before = [r for r in old if r["kind"] == kind]
@@ -240,8 +245,12 @@ def count(records: list[dict[str, Any]], old: list[dict[str, Any]]) -> dict[str,
         row["violations"] = sum(bool(r["wrong"]) for r in of_kind)
         row["died"] = sum(w[0] == "process" for r in of_kind for w in r["wrong"])
         row["no oracle"] = sum("no_oracle" in r or "harness" in r for r in of_kind)
+        row["infinite bounds"] = sum(r.get("infinite", 0) for r in of_kind)
+        row["no gap"] = sum(r.get("none", 0) for r in of_kind)
         for name in SOLVERS:
             row[name] = dict(collections.Counter(r.get("status", {}).get(name, "none") for r in of_kind))
+            again = [r for r in of_kind if r["number"] in both]
+            row[f"{name}, of these"] = dict(collections.Counter(r.get("status", {}).get(name, "none") for r in again))
             row[f"{name}, before"] = dict(collections.Counter(r.get("status", {}).get(name, "none") for r in before))
             row[f"{name}, CONVERGED but wrong before"] = sum(wrongly_converged(r, name) for r in before)
         table[kind] = row
@@ -261,23 +270,26 @@ def page(table: dict[str, dict[str, Any]], records: list[dict[str, Any]], comman
         f"    {command}",
         "",
         f"{total:,} problems of `tests/many_digits.py` (1 to 60 states, 1 to 4 actions), each with both solvers",
-        "(biasing: at most 50 iterations) and `certify` of a random, a greedy and a stay-put policy, held against an",
+        "(biasing: at most 50 iterations) and `certify` of five policies (random, the same in single precision,",
+        "greedy, one that stays put, and the same with some 1e-180 of anything else), held against an",
         "oracle of 50 to 950 digits. A violation is any of: bounds that leave out theta*, a gap below the true loss,",
         "an objective outside its bounds, CONVERGED with theta further off than the tolerance, NaN, an exception, a",
         "process that dies. *No oracle*: its bounds did not meet in the digits or the time that it has; there, all",
         "that is checked is that nothing is raised.",
         "",
-        "Share CONVERGED: of all problems of the kind. *Before*: the package before its bounds were theorems of",
-        f"floating point too, on the first {n_before:,}, less those whose theta or bounds were wrong (how many, in",
-        "brackets).",
+        "Infinite bounds and gaps that are not given are counted, of both solvers and all policies. Share CONVERGED: of",
+        "all problems of the kind. *Before*: the package before its bounds were theorems of floating point too, on",
+        f"{n_before:,} of them, less those whose theta or bounds were wrong (how many, in brackets); *now*: on the same.",
         "",
-        "| kind | problems | violations | died | no oracle | soft policy iteration | before | biasing | before |",
-        "|---|---|---|---|---|---|---|---|---|",
+        "| kind | problems | violations | died | no oracle | infinite bounds | no gap "
+        "| soft policy iteration | now | before | biasing | now | before |",
+        "|---" * 13 + "|",
     ]
     for kind, row in table.items():
-        cells = [kind.replace("_", " "), *(row[key] for key in ("problems", "violations", "died", "no oracle"))]
+        cells = [kind.replace("_", " "), *(row[key] for key in COUNTED)]
         for name in SOLVERS:
-            cells += [_share(row[name]), _share(row[f"{name}, before"], row[f"{name}, CONVERGED but wrong before"])]
+            cells += [_share(row[name]), _share(row[f"{name}, of these"])]
+            cells += [_share(row[f"{name}, before"], row[f"{name}, CONVERGED but wrong before"])]
         lines.append("| " + " | ".join(map(str, cells)) + " |")
     lines += ["", "| solver | " + " | ".join(statuses := _statuses(table)) + " |", "|---|" + "---|" * len(statuses)]
     for name in SOLVERS:

@@ -87,7 +87,7 @@ def soft_backup(q: np.ndarray, prior: np.ndarray, beta: float) -> tuple[np.ndarr
 class Objective(NamedTuple):
     """J(pi), the long-run reward rate less KL/beta from the start, reward a step."""
 
-    value: float
+    value: float  # J but for rounding; only somewhere between low and high where products of probabilities underflow
     low: float  # low <= J <= high in exact arithmetic
     high: float
 

@@ -72,16 +72,15 @@ class Elimination:
 
     ptr: np.ndarray  # [n + 1], CSR of the pattern
     ind: np.ndarray
-    rank: np.ndarray  # [n], place in the elimination; empty where the chains are too large or fill too much
-    lu: tuple[np.ndarray, ...]  # (lptr, lind, uptr, uind) of ``kernels.lu_pattern``; likewise
+    rank: np.ndarray  # [n], place in the elimination; as the states come where the chains are too large to be ordered
+    lu: tuple[np.ndarray, ...]  # (lptr, lind, uptr, uind) of ``kernels.lu_pattern``; empty: too large, or too much fill
 
     @classmethod
     def of(cls, ptr: np.ndarray, ind: np.ndarray) -> Elimination:
         """For CSR chains (ptr, ind)."""
         n = len(ptr) - 1
-        too_large = cls(ptr, ind, np.empty(0, np.int32), ())
         if n > SPARSE_STATES:
-            return too_large
+            return cls(ptr, ind, np.arange(n, dtype=np.int32), ())
         # Any values will do: SuperLU is asked for its minimum-degree ordering alone.
         some = 2 * sp.eye_array(n) - sp.csr_array((np.full(ind.size, 1.0 / n), ind, ptr), shape=(n, n))
         ordered = spla.splu(
@@ -90,7 +89,7 @@ class Elimination:
         rank = ordered.perm_c.astype(np.int32)
         ptr, ind = ptr.astype(np.int64), ind.astype(np.int32)
         lu = kernels.lu_pattern(ptr, ind, rank)
-        return too_large if (np.diff(lu[2]) ** 2).sum() > MAX_OPERATIONS else cls(ptr, ind, rank, lu)
+        return cls(ptr, ind, rank, lu if (np.diff(lu[2]) ** 2).sum() <= MAX_OPERATIONS else ())
 
     @property
     def fits(self) -> bool:
@@ -151,7 +150,7 @@ class _CompiledLU:
 class _SuperLU:
     """The same by SuperLU, for factors that are large."""
 
-    def __init__(self, chain: sp.csr_array, ref: int, leak: float, row: np.ndarray) -> None:
+    def __init__(self, elimination: Elimination, chain: sp.csr_array, ref: int, leak: float, row: np.ndarray) -> None:
         n = chain.shape[0]
         origin = np.repeat(np.arange(n), np.diff(chain.indptr))
         away = chain.indices != origin
@@ -160,22 +159,22 @@ class _SuperLU:
         if not (diagonal > 0).all():  # SuperLU reads outside its arrays where a diagonal entry is missing
             raise SingularChainError(f"state {int(np.argmin(diagonal))} is never left")
         kept = away & (chain.indices != ref) & (origin != ref)
-        off = sp.csr_array((-chain.data[kept], (origin[kept], chain.indices[kept])), shape=(n, n))
-        cut = sp.csc_array(off + sp.diags_array(diagonal))
+        rank = elimination.rank
+        off = sp.csr_array((-chain.data[kept], (rank[origin[kept]], rank[chain.indices[kept]])), shape=(n, n))
+        cut = sp.csc_array(off + sp.diags_array(diagonal[elimination.order]))
+        ordering = "MMD_AT_PLUS_A" if n > SPARSE_STATES else "NATURAL"  # ordered already
         try:
             # No pivoting: an M-matrix needs none, and the fill stays what the ordering makes it.
-            self._lu = spla.splu(
-                cut, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-            )
+            self._lu = spla.splu(cut, permc_spec=ordering, diag_pivot_thresh=0.0, options={"SymmetricMode": True})
         except RuntimeError as error:  # exactly singular
             raise SingularChainError(str(error)) from error
-        self._ref, self._row = ref, row
+        self._elimination, self._ref, self._row = elimination, ref, row
 
-    def solve(self, x: np.ndarray) -> np.ndarray:
-        return np.asarray(self._lu.solve(x))
+    def solve(self, x: np.ndarray, transposed: str = "N") -> np.ndarray:
+        return np.asarray(self._lu.solve(x[self._elimination.order], transposed)[self._elimination.rank])
 
     def visits(self) -> np.ndarray:
-        found = np.maximum(self._lu.solve(self._row, "T"), 0.0)
+        found = np.maximum(self.solve(self._row, "T"), 0.0)
         found[self._ref] = 1.0
         return np.asarray(found)
 
@@ -202,7 +201,7 @@ class RegenerativeLU:
         if self.elimination.fits:
             self._lu = _CompiledLU(self.elimination, self.chain.data, ref, 1.0 - discount)
         else:
-            self._lu = _SuperLU(self.chain, ref, 1.0 - discount, self._row)
+            self._lu = _SuperLU(self.elimination, self.chain, ref, 1.0 - discount, self._row)
         ones = np.ones(n)
         ones[ref] = 0.0
         with np.errstate(over="ignore", invalid="ignore"):

@@ -891,7 +891,7 @@ def _soft_maximum(q, weight, beta, choice):
     found = top + logarithm / beta
     size = -logarithm if below >= -0.5 else abs(logarithm) + math.log(n)
     # The last: products that underflow.
-    rounding = (n + 20) * epsilon * abs(size) / beta + 2.0 * epsilon * abs(found) + (n + 1) * 1e-323 / beta
+    rounding = (2 * n + 20) * epsilon * abs(size) / beta + 2.0 * epsilon * abs(found) + (n + 1) * 1e-323 / beta
     return found, rounding
 
 
@@ -973,7 +973,7 @@ def _relative_entropy(policy, prior):
         return 0.0, 0.0
     apart = (abs(total - of_prior) + (n + 2) * epsilon) / total
     found = max(found / total, 0.0)
-    rounding = (n + 40) * epsilon * found + 8.0 * epsilon * size
+    rounding = (n + 40) * epsilon * found + 8.0 * epsilon * size + n * 1e-322  # the last: products that underflow
     return max(found - rounding - apart * apart, 0.0), found + rounding
 
 

@@ -638,11 +638,16 @@ def problem(seed: int, number: int) -> Given:
 
 
 def policies(given: Given, best: np.ndarray, seed: int) -> dict[str, np.ndarray]:
-    """A random one, a greedy one of ``best`` [S, A], and the one that stays put where it can; each [S, A]."""
+    """A random one, its rows in single precision, a greedy one of ``best`` [S, A], the one that stays put where it can,
+    and that one with a chance of some 1e-180 of anything else; each [S, A]."""
     n, a = given.reward.shape
     own = given.transition[np.arange(n), :, np.arange(n)]
+    rng = np.random.default_rng([seed, 1])
+    random, stay = rng.dirichlet(np.ones(a), n), np.eye(a)[own.argmax(1)]
     return {
-        "random": np.random.default_rng([seed, 1]).dirichlet(np.ones(a), n),
+        "random": random,
+        "single precision": random.astype(np.float32).astype(np.float64),
         "greedy": np.eye(a)[best.argmax(1)],
-        "stay": np.eye(a)[own.argmax(1)],
+        "stay": stay,
+        "all but stay": np.where(stay > 0, 1.0, 10.0 ** -rng.uniform(160, 200, (n, a))),
     }

@@ -30,7 +30,7 @@ def digits():
 
 @pytest.mark.parametrize("kind", range(len(KINDS)), ids=lambda kind: KINDS[kind].__name__)
 def test_nothing_that_is_called_proven_is_wrong(kind, monkeypatch):
-    """Both solvers, ``certify`` of a random, a greedy and a stay-put policy, and three routes to the objective."""
+    """Both solvers, ``certify`` of five policies, and three routes to the objective."""
     # Iterations that lead nowhere take seconds.
     monkeypatch.setitem(adversarial.SOLVERS, "biasing", partial(solve_biasing, max_steps=8))
     checked = 0

@@ -100,19 +100,26 @@ def test_policy_gains_lie_between_their_ends():
 
 
 def rational_shares(chain):
-    """Stationary distribution of a dense chain, by elimination in fractions from the off-diagonal entries."""
+    """The d with d K = d and sum 1 for a dense chain given by its off-diagonal entries: linear equations in fractions,
+    and a check that they hold exactly."""
     n = len(chain)
-    p = [[x if isinstance(x, Fraction) else Fraction(float(x)) for x in row] for row in chain]
-    for k in range(n - 1, 0, -1):
-        out = sum(p[k][:k])
-        for i in range(k):
-            p[i][k] /= out
-            for j in range(k):
-                p[i][j] += p[i][k] * p[k][j]
-    x = [Fraction(1)]
-    for k in range(1, n):
-        x.append(sum(x[i] * p[i][k] for i in range(k)))
-    return [v / sum(x) for v in x]
+    q = [[x if isinstance(x, Fraction) else Fraction(float(x)) for x in row] for row in chain]
+    for s in range(n):
+        q[s][s] = -sum(x for t, x in enumerate(q[s]) if t != s)  # K - I
+    equations = [[q[s][t] for s in range(n)] + [Fraction(0)] for t in range(n - 1)] + [[Fraction(1)] * (n + 1)]
+    for k in range(n):
+        at = next(i for i in range(k, n) if equations[i][k] != 0)
+        equations[k], equations[at] = equations[at], equations[k]
+        pivot = equations[k][k]
+        equations[k] = [x / pivot for x in equations[k]]
+        for i in range(n):
+            if i != k and equations[i][k] != 0:
+                factor = equations[i][k]
+                equations[i] = [x - factor * y for x, y in zip(equations[i], equations[k], strict=True)]
+    d = [row[n] for row in equations]
+    assert sum(d) == 1
+    assert all(sum(d[s] * q[s][t] for s in range(n)) == 0 for t in range(n))
+    return d
 
 
 def test_shares_of_time_are_as_accurate_as_said():
