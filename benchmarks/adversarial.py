@@ -277,9 +277,10 @@ def page(table: dict[str, dict[str, Any]], records: list[dict[str, Any]], comman
         "process that dies. *No oracle*: its bounds did not meet in the digits or the time that it has; there, all",
         "that is checked is that nothing is raised.",
         "",
-        "Infinite bounds and gaps that are not given are counted, of both solvers and all policies. Share CONVERGED: of",
-        "all problems of the kind. *Before*: the package before its bounds were theorems of floating point too, on",
-        f"{n_before:,} of them, less those whose theta or bounds were wrong (how many, in brackets); *now*: on the same.",
+        "Infinite bounds and gaps that are not given are counted, of both solvers and all policies. Share CONVERGED:",
+        "of all problems of the kind. *Before*: the package before its bounds were theorems of floating point too, on",
+        f"{n_before:,} of them, less those whose theta or bounds were wrong (their number in brackets); *now*: on the",
+        "same.",
         "",
         "| kind | problems | violations | died | no oracle | infinite bounds | no gap "
         "| soft policy iteration | now | before | biasing | now | before |",
