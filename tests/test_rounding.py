@@ -491,3 +491,16 @@ def test_products_that_underflow_are_in_the_bounds():
     a, b = mpf(prior[0, 0]), mpf(prior[0, 1])
     theta = -mp.log((a + b * mp.exp(mpf(1e-8) * mpf(-1e-9))) / (a + b)) / mpf(1e-8)
     assert mpf(found.theta_bounds[0]) <= theta <= mpf(found.theta_bounds[1])
+
+
+def test_divergences_below_range_are_in_the_bounds():
+    """One state, no reward, beta 1e-100: J = -KL/beta with KL near 1e-310, of which doubles keep few digits."""
+    rng = np.random.default_rng(11)
+    for _ in range(200):
+        prior = np.array([[rng.uniform(1, 9) * 1e-311, 1.0]])
+        policy = np.array([[rng.uniform(1, 9) * 1e-310, 1.0]])
+        low, high = policy_gains(sp.csr_array(np.ones((2, 1))), np.zeros((1, 2)), prior, 1e-100, policy, np.zeros(1))
+        with mp.workdps(700):
+            x, w = mpf(policy[0, 0]), mpf(prior[0, 0])
+            kl = (x * mp.log(x / w)) / (1 + x) + mp.log((1 + w) / (1 + x))
+            assert mpf(low[0]) <= -kl / mpf(1e-100) <= mpf(high[0])

@@ -1,6 +1,7 @@
 """What the exact solvers prove, against dense oracles and closed forms, where a plain run would not show a mistake."""
 
 from dataclasses import replace
+from fractions import Fraction
 
 import numpy as np
 import oracle
@@ -8,7 +9,8 @@ import pytest
 import torch
 from conftest import random_mdp, random_policy
 
-from erl_torch import Status, TabularMDP, certify, iterate_biasing, solve_soft_bellman
+from erl_torch import InputError, Status, TabularMDP, certify, iterate_biasing, solve_biasing, solve_soft_bellman
+from erl_torch.solvers import soft_bellman
 from erl_torch.solvers.compiled import NewtonPattern
 from erl_torch.solvers.problem import Problem
 from erl_torch.solvers.result import exact_solution
@@ -107,3 +109,88 @@ def test_a_tilted_row_is_as_defined():
         log_tilted = log_terms - expected[:, None]
         np.testing.assert_allclose(tilted.reshape(10, 5), np.exp(log_tilted), rtol=1e-9, atol=1e-300)
         np.testing.assert_allclose(kl, (np.exp(log_tilted) * (log_tilted - np.log(rows))).sum(1), rtol=1e-9)
+
+
+def moving(to, reward):
+    """One action; state s leads to to[s]."""
+    return TabularMDP(np.eye(len(to))[to][:, None], np.array(reward)[:, None])
+
+
+def test_the_model_known_before_needs_one_class_as_the_target_does():
+    """Known: 0 stays, 1 goes to 0. Target: they take turns, theta* -1/2."""
+    known, target = moving([0, 0], [0.0, 1.0]), moving([1, 0], [0.0, 1.0])
+    with pytest.raises(InputError, match=r"known before, beside target: once in the closed set \[0\]"):
+        iterate_biasing(known, 1.0, target=target)
+    found = solve_biasing(known, 1.0, target=target)
+    assert found.status is Status.REDUCIBLE
+    assert found.theta is None
+    assert found.rho is None
+    assert found.theta_bounds[0] <= -0.5 <= found.theta_bounds[1]
+    assert solve_biasing(target, 1.0, target=target).theta == pytest.approx(-0.5, abs=1e-12)
+
+
+def test_a_target_on_other_states_is_refused():
+    """From 0 the known model leads to 1, the target stays."""
+    p = np.array([[[0.0, 1.0]], [[1.0, 0.0]]])
+    stays = np.array([[[1.0, 0.0]], [[1.0, 0.0]]])
+    start = [1.0, 0.0]
+    known, target = TabularMDP(p, np.zeros((2, 1)), start), TabularMDP(stays, np.zeros((2, 1)), start)
+    with pytest.raises(InputError, match="the same states"):
+        solve_biasing(known, 1.0, target=target)
+
+
+def test_at_the_first_iteration_with_small_kl_the_bounds_say_whether_it_has_converged():
+    """One action: iteration 0 is exact, its KL 0 where the rewards are equal; CONVERGED wins over STOPPED."""
+    found = solve_biasing(moving([1, 0], [1.0, 1.0]), 1.0, stop="kl")
+    assert found.status is Status.CONVERGED
+    assert found.k == 0
+    assert found.theta == pytest.approx(-1, abs=1e-12)
+
+
+def test_an_eigenvector_beyond_doubles_ends_the_iteration():
+    """At beta 3.8 and a penalty of 1e9 two parts are joined by exp(-4e9): it took 200 iterations of a second each."""
+    t = np.array([[[1.0, 0.0], [0.0, 1.0]], [[0.0, 1.0], [1.0, 0.0]]])
+    t[0, 1], t[1, 1] = [1.0, 0.0], [0.0, 1.0]
+    t[0, 1] = [1 - 1e-12, 1e-12]
+    t[1, 1] = [1e-12, 1 - 1e-12]
+    mdp = TabularMDP(t, [[0.3, -1e9], [0.2, -1e9]])
+    states = list(iterate_biasing(mdp, 4.0))
+    assert len(states) < 30
+    # Apart, the states earn .3 - log(2)/4 and .2 - log(2)/4; leaving never pays.
+    assert states[-1].theta_bounds[0] <= -(0.3 - np.log(2) / 4) <= states[-1].theta_bounds[1]
+    found = solve_biasing(mdp, 4.0)
+    assert found.n_steps < 30
+
+
+def test_a_gap_is_not_below_the_loss_where_the_difference_rounds_down():
+    """One state, one action: J = -2^-60 and g* at most 1, so the loss may be 1 + 2^-60, which rounds to 1."""
+    mdp = TabularMDP([[[1.0]]], [[-(2.0**-60)]])
+    wide = replace(solve_soft_bellman(mdp, 1.0), theta_bounds=(-1.0, 1.0))
+    gap = certify(wide, mdp, 1.0, best=wide).gap
+    assert 1 + Fraction(1, 2**60) <= Fraction(gap) < 1 + Fraction(1, 2**50)
+
+
+def test_a_poor_value_does_not_spoil_the_gap_of_its_policy():
+    """One action: whatever V is, the policy loses nothing; the gains of V alone would say that it may lose 100."""
+    mdp = moving([1, 0], [0.0, 1.0])
+    found = exact_solution(mdp, Problem.of(mdp, 1.0), np.array([0.0, 100.0]), Status.STEP_LIMIT, 1, (-0.5, -0.5))
+    assert 0 <= found.gap < 1e-12
+
+
+def test_the_state_with_the_narrowest_bounds_is_kept(monkeypatch):
+    """A last step that made the bounds wider does not count, neither in the iteration nor in polishing it."""
+    rng = np.random.default_rng(3)
+    mdp = random_mdp(rng, 4, 3)
+    problem = Problem.of(mdp, 5.0)
+    good = solve_soft_bellman(mdp, 5.0)
+    value = good.value.numpy()
+    states = [
+        soft_bellman._state(problem, v, i + 1, np.inf) for i, v in enumerate((0.9 * value, value + 1.0, 0 * value))
+    ]
+    monkeypatch.setattr(soft_bellman, "iterate_soft_bellman", lambda *_: iter(states))
+    found = soft_bellman.solve_problem(problem, mdp)
+    np.testing.assert_allclose(found.policy, good.policy, atol=1e-9)
+    monkeypatch.setattr(soft_bellman, "_undiscounted", lambda *_: iter(states))
+    kept, bounds = soft_bellman.polish(problem, np.zeros(4), (-np.inf, np.inf), 1e-300)
+    np.testing.assert_array_equal(kept, states[1].value)
+    assert bounds[1] - bounds[0] <= states[1].width
