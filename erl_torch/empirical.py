@@ -55,7 +55,7 @@ class EmpiricalMDP:
         Raises:
             InputError: beta or prior out of range, or no state that is ever returned to.
         """
-        checks.temperature("beta", beta)
+        beta = checks.temperature("beta", beta)
         prior = check_prior("prior_policy", prior_policy, self.n_states, self.n_actions)
         used, entries, message, reducible = self._part()
         inside = used.any(1)

@@ -15,6 +15,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
+from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.files import read_npz, write_npz
 
@@ -122,7 +123,7 @@ class Transitions:
         try:
             return cls(**{name: arrays[name] for name in COLUMNS})
         except InputError as error:
-            raise InputError(f"{path}: {error.key}", error.value, error.allowed) from error
+            raise error.of_file(path) from error
 
 
 class Checksum:
@@ -209,13 +210,11 @@ def tuple_at(data: Recording, t: int) -> tuple[int, int, float]:
 
 
 def _column(name: str, value: Any) -> np.ndarray:
-    if hasattr(value, "detach"):
-        value = value.detach().cpu().numpy()
-    column = np.asarray(value)
+    column = checks.real(name, value)
     if column.ndim != 1:
         raise InputError(name, f"array of shape {column.shape}", "one-dimensional")
     if name == "r":
-        if column.dtype.kind not in "iuf":
+        if column.dtype.kind == "b":
             raise InputError(name, f"dtype {column.dtype}", "an array of numbers")
         column = np.ascontiguousarray(column, dtype=np.float64)
         if not np.isfinite(column).all():

@@ -193,11 +193,13 @@ def test_free_memory_is_within_the_process_s_own_limit():
 
 
 def test_counts_are_whole_numbers_of_64_bits():
-    for value in (math.nan, math.inf, -1, 0.5, True, "3", None, 2**63, 10**5000):
+    for value in (math.nan, math.inf, -1, 0.5, 3.0, True, "3", None, 2**63, 10**5000):
         with pytest.raises(InputError, match=r"^n=.*: must be (a whole number >= 0|below 2\*\*63)$"):
             checks.at_least("n", value, 0)
-    for good in (0, 3.0, np.int32(5), 2**63 - 1):
-        checks.at_least("n", good, 0)
+    for good in (0, np.int32(5), 2**63 - 1):
+        found = checks.at_least("n", good, 0)
+        assert found == good
+        assert type(found) is int
 
 
 @pytest.mark.parametrize(

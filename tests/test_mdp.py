@@ -81,10 +81,10 @@ def changed(array, index, value):
         ((P, changed(R, (1, 0), np.inf)), r"reward\[1, 0\]=inf: must be finite"),
         ((P, changed(R, (1, 0), -1e300)), r"reward\[1, 0\]=-1e\+300: must be finite, and at most 1e\+100 in size"),
         ((P, R.ravel()), r"reward=array of shape \(6,\): must be of shape \[n_states, n_actions\]"),
-        ((P, "reward"), r"reward=str: must be an array of numbers"),
+        ((P, "reward"), r"reward=str of dtype <U6: must be an array of real numbers"),
         ((P, R, [0.5, 0.5]), r"start=array of shape \(2,\): must be of shape \[3\]"),
         ((P, R, [0.5, 0.5, 0.5]), r"start=sum 1.5: must be 1 in sum, within 1e-05"),
-        ((P, R, [1.5, -0.5, 0.0]), r"start=array: must be finite and >= 0"),
+        ((P, R, [1.5, -0.5, 0.0]), r"start\[1\]=-0.5: must be finite and >= 0"),
     ],
 )
 def test_refuses(arguments, message):

@@ -185,6 +185,8 @@ def _iterate(problem: Problem, ref: int, known: Problem | None, max_steps: int) 
 def _problem(mdp: TabularMDP, beta: float, prior_policy: Any, target: TabularMDP | None) -> Problem:
     if target is None:
         return Problem.of(mdp, beta, prior_policy)
+    for key, one in (("mdp", mdp), ("target", target)):
+        checks.instance(key, one, TabularMDP, "a TabularMDP")
     if target.reward.shape != mdp.reward.shape:
         raise InputError("target", f"MDP of shape {target.reward.shape}", f"of the shape of mdp, {mdp.reward.shape}")
     problem, known = Problem.of(target, beta, prior_policy), Problem.of(mdp, beta, prior_policy)
