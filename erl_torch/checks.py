@@ -20,6 +20,7 @@ MOST = 2**63 - 1  # compiled loops and files count in 64 bits
 MOST_WORKERS = 1024  # threads or processes at once: systems allow a few thousand
 PROCESS_BYTES = 250_000_000  # of a process at work, about
 SMALLEST_BETA, LARGEST_BETA = 1e-100, 1e100  # products with rewards stay in double precision
+MOST_DEEP = 4  # lists in lists, looked into
 MOST_SHOWN = 500  # characters of a value
 WORTH_A_LOOK = 1 << 27  # bytes from which an array must find room
 REAL = "biuf"  # numpy's kinds of numbers that a double can hold
@@ -99,14 +100,28 @@ def at_least(key: str, value: Any, least: int) -> int:
 
 
 def plain(settings: Any) -> None:
-    """Numbers of numpy's among the fields of a frozen dataclass become Python's: with those of single precision,
-    arithmetic would be of single precision."""
+    """Numbers of numpy's among the fields of a frozen dataclass become Python's (with those of single precision,
+    arithmetic would be of single precision), and whole numbers floats where the field is one (each type of argument is
+    compiled for anew). Raises InputError for a field of truth values that holds another."""
     for item in fields(settings):
-        object.__setattr__(settings, item.name, _python(getattr(settings, item.name)))
+        value = _python(getattr(settings, item.name))
+        if item.type == "bool":
+            value = flag(item.name, value)
+        if str(item.type).startswith("float") and is_number(value):
+            try:
+                value = float(value)
+            except OverflowError:  # refused where it is looked at
+                value = math.inf
+        object.__setattr__(settings, item.name, value)
 
 
 def _python(value: Any) -> Any:
     return value.item() if isinstance(value, (np.integer, np.floating)) else value
+
+
+def seed(key: str, value: Any) -> int | np.random.Generator:
+    """``value``, as an int unless it is a generator. Raises InputError unless it is one, or a whole number >= 0."""
+    return value if isinstance(value, np.random.Generator) else at_least(key, value, 0)
 
 
 def workers(key: str, value: Any) -> int:
@@ -213,19 +228,33 @@ def one_of(key: str, value: Any, allowed: tuple[str, ...]) -> None:
         raise InputError(key, value, " or ".join(allowed))
 
 
+def flag(key: str, value: Any) -> bool:
+    """``value`` as a bool. Raises InputError unless it is one."""
+    instance(key, value, (bool, np.bool_), "True or False")
+    return bool(value)
+
+
+def sequence(key: str, value: Any) -> tuple[Any, ...]:
+    """``value`` as a tuple. Raises InputError unless it is a list, an array or the like."""
+    try:
+        return tuple(value)
+    except (TypeError, RuntimeError) as error:
+        raise InputError(key, f"{_shown(value)} ({type(value).__name__})", "a list") from error
+
+
 def instance(key: str, value: Any, kind: type | tuple[type, ...], allowed: str) -> None:
     """Raise InputError unless ``value`` is of a class of ``kind``, which ``allowed`` describes."""
     if not isinstance(value, kind):
         raise InputError(key, f"{_shown(value)} ({type(value).__name__})", allowed)
 
 
-def device(key: str, value: str) -> None:
+def device(key: str, value: Any) -> None:
     """Raise InputError unless torch can put a tensor on ``value``."""
     import torch
 
     try:
-        torch.empty(0, device=value)
-    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        torch.empty(0, device=torch.device(value))
+    except (RuntimeError, AssertionError, NotImplementedError, TypeError, ValueError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(key, value, f"a device that is present, as cpu ({reason[:120]})") from error
 
@@ -241,7 +270,7 @@ def array(key: str, value: Any, shape: Shape, entries: Entries = FINITE) -> np.n
     """
     found = real(key, value)
     _check_shape(key, found.shape, shape)
-    _check_room(key, found.shape)
+    room(key, found.shape)
     with np.errstate(over="ignore"):  # of extended precision; the entry is refused below
         found = np.array(found, np.float64, order="C")
     usable, allowed = entries
@@ -260,14 +289,12 @@ def real(key: str, value: Any) -> np.ndarray:
     """
     if is_sparse(value):
         whole = tuple(value.shape)
-        _check_room(key, whole)
+        room(key, whole)
         value = _tensor(key, value).to_dense() if hasattr(value, "detach") else sparse(key, value, whole).toarray()
     if hasattr(value, "detach"):
         value = _tensor(key, value).numpy()
-    if np.ma.isMaskedArray(value):
-        if np.ma.is_masked(value):
-            raise InputError(key, "an array with masked entries", "an array without")
-        value = value.data
+    if _masked(value):
+        raise InputError(key, "an array with masked entries", "an array without")
     try:
         found = np.asarray(value)
         if found.dtype.kind == "O" and found.size and all(isinstance(x, numbers.Real) for x in found.flat):
@@ -287,7 +314,7 @@ def sparse(key: str, value: Any, shape: Shape, more: str = "") -> sp.csr_array:
     """
     import scipy.sparse as sp
 
-    if not is_sparse(value):
+    if not is_sparse(value) or (hasattr(value, "detach") and value.dense_dim() > 0):
         value = real(key, value)
     _check_shape(key, tuple(value.shape), shape, more)
     try:
@@ -297,7 +324,7 @@ def sparse(key: str, value: Any, shape: Shape, more: str = "") -> sp.csr_array:
         if value.dtype.kind not in REAL:
             raise InputError(key, _described(value, value.dtype), "a matrix of real numbers")
         if not sp.issparse(value):
-            _check_room(key, value.shape)
+            room(key, value.shape)
         # Before anything is converted: conversions and compiled loops trust the indices.
         elif hasattr(value, "check_format"):
             value.check_format(full_check=True)
@@ -325,14 +352,25 @@ def is_sparse(value: Any) -> bool:
     return bool(sp.issparse(value))
 
 
+def _masked(value: Any, depth: int = 0) -> bool:
+    """Whether an array, or one in a list, has masked entries: numpy would go on with what is behind the mask."""
+    if isinstance(value, (list, tuple)):
+        return depth < MOST_DEEP and any(_masked(item, depth + 1) for item in value)
+    return isinstance(value, np.ma.MaskedArray) and bool(np.ma.is_masked(value))
+
+
 def _tensor(key: str, value: Any) -> Any:
     """A tensor on the CPU, in double precision where it is of floats, with strides or as COO with indices in range."""
     import torch
 
-    if value.is_complex():
+    if value.is_complex() or value.is_nested:
         raise InputError(key, _described(value, value.dtype), "an array of real numbers")
+    if not is_sparse(value):
+        room(key, tuple(value.shape))
     try:
         value = value.detach().cpu()
+        if value.is_quantized:
+            value = value.dequantize()
         if value.layout is torch.sparse_coo:
             parts = (value._indices(), value._values())
             value = torch.sparse_coo_tensor(*parts, value.shape, check_invariants=True)
@@ -368,7 +406,8 @@ def _check_shape(key: str, found: tuple[int, ...], shape: Shape, more: str = "")
         raise InputError(key, f"array of shape {found}", f"of shape [{', '.join(map(str, shape))}]{more}")
 
 
-def _check_room(key: str, shape: tuple[int, ...]) -> None:
+def room(key: str, shape: tuple[int, ...]) -> None:
+    """Raise InputError unless an array of this shape finds room, before it is made."""
     needed = 8 * math.prod(shape)
     if needed > WORTH_A_LOOK:
         memory(key, f"array of shape {shape}", needed, "in double precision it")

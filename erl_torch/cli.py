@@ -208,7 +208,7 @@ def run(main: Callable[[], Any], about: str, conf: Path, config_name: str) -> No
                 _same_modules(directory, arguments, [a for a in typed if a != argument], conf, config_name)
         for argument in arguments:
             group, _, value = argument.partition("=")
-            if group in SCHEMAS and re.fullmatch(r"[-+.\d].*|true|false", value, re.IGNORECASE):
+            if group in SCHEMAS and re.fullmatch(r"[-+.\d].*|true|false|null", value, re.IGNORECASE):
                 options = sorted(path.stem for path in (conf / group).glob("*.yaml"))
                 raise InputError(group, value, " or ".join(options))  # Hydra has a bare ValueError for it
         if {"-h", "--help"} & set(arguments):
@@ -312,7 +312,7 @@ def _explain(error: Exception) -> str:
     """One line out of the several of Hydra and OmegaConf: the override where it is named, then the reason."""
     reason = error.__cause__ if isinstance(error.__cause__, OmegaConfBaseException) else error
     said = str(reason)
-    choice = re.search(r"Could not find '(\S+)/([^'/]+)'\s+Available options in '[^']*':\n((?:\t\S+\n?)+)", said)
+    choice = re.search(r"Could not find '(\S+)/([^'/]*)'\s+Available options in '[^']*':\n((?:\t\S+\n?)+)", said)
     if choice:
         group, name, options = choice.groups()
         if group.startswith("hydra/") and name in sweeps.EXTRAS:
@@ -329,7 +329,8 @@ def _explain(error: Exception) -> str:
         names = [field.name for field in fields(schema) if field.name != "name"]
         given = next((a for a in sys.argv[1:] if a.lstrip("+~").startswith(f"{subject}=")), subject)
         return f"{given}: no such key; there are {', '.join(names)}"
-    key, typed, value = str(subject).partition("=")
+    given = next((a for a in sys.argv[1:] if a.startswith(str(subject))), str(subject))  # whole, if it has spaces
+    key, typed, value = given.partition("=")
     key = key.lstrip("+~")
     takes = allowed(key) if typed else None
     if takes is not None and isinstance(reason, ValidationError):

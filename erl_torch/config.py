@@ -386,9 +386,9 @@ def allowed(key: str) -> str | None:
         for item in fields(schema):
             if item.name == (rest or key):
                 kind, _, optional = str(item.type).partition(" | ")
-                said = f"a whole number >= {FROM.get(item.name, 1)}" if kind == "int" else KINDS.get(kind)
+                said = f"a whole number >= {FROM.get(item.name, 1)}, in digits" if kind == "int" else KINDS.get(kind)
                 return said and said + (", or null" if optional else "")
-    return None
+    return KINDS["float"] if group and allowed(group) == KINDS["dict[str, float]"] else None
 
 
 def slug(text: Any) -> str:

@@ -44,8 +44,8 @@ class TabularMDP:
     are the rows as they stand in ``transition``. A ``Note`` names the largest correction above 1e-9.
 
     Raises:
-        InputError: no real numbers, wrong shape, an index out of range, a value that is not finite or negative, a row that does not
-            sum to 1 within 1e-5, or to 0 with ``normalise`` (the row is named).
+        InputError: no real numbers, wrong shape, an index out of range, a value that is not finite or negative, a row
+            that does not sum to 1 within 1e-5, or to 0 with ``normalise`` (the row is named).
     """
 
     transition: sp.csr_array  # [S*A, S], float64, sorted, no repeated or zero entries
@@ -61,7 +61,7 @@ class TabularMDP:
         start = np.full(n_states, 1.0 / n_states)
         if self.start is not None:
             start = checks.array("start", self.start, (n_states,), checks.NOT_NEGATIVE)
-        tolerance = np.inf if normalise else ROW_SUM_TOLERANCE
+        tolerance = np.inf if checks.flag("normalise", normalise) else ROW_SUM_TOLERANCE
         largest = max(
             normalise_rows(lambda row: _row_name(row, n_actions), transition.indptr, transition.data, tolerance),
             normalise_rows(lambda row: "start", np.array([0, n_states]), start, tolerance),
@@ -111,7 +111,9 @@ def check_policy(key: str, policy: Any, n_states: int, n_actions: int) -> np.nda
 
     Raises InputError naming ``key``.
     """
+    n_states, n_actions = checks.at_least("n_states", n_states, 1), checks.at_least("n_actions", n_actions, 1)
     if policy is None:
+        checks.room("n_states * n_actions", (n_states, n_actions))
         return np.full((n_states, n_actions), 1.0 / n_actions)
     table = checks.array(key, policy, (n_states, n_actions), checks.NOT_NEGATIVE)
     rows = np.arange(n_states + 1) * n_actions

@@ -177,9 +177,9 @@ def _start(base: Any, start: Any, n_states: int) -> np.ndarray:
         start = getattr(base, "initial_state_distrib", getattr(base, "isd", None))
     if start is None:
         raise InputError("start", None, "given: the environment does not tell its start distribution")
-    start = checks.array("start", start, (n_states,), checks.NOT_NEGATIVE)
-    normalise_rows(lambda row: "start", np.array([0, n_states]), start, np.inf)
-    return start
+    found = checks.array("start", start, (n_states,), checks.NOT_NEGATIVE)
+    normalise_rows(lambda row: "start", np.array([0, n_states]), found, np.inf)
+    return found
 
 
 def _absorbed(mdp: TabularMDP, states: np.ndarray, reward: np.ndarray) -> TabularMDP:

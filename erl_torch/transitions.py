@@ -11,7 +11,7 @@ import zlib
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
@@ -23,6 +23,7 @@ COLUMNS = ("s", "a", "r", "s_next", "a_next")
 Part = TypeVar("Part")
 
 
+@runtime_checkable
 class Recording(Protocol):
     """A stream of tuples of any size, the same in every pass."""
 
@@ -100,6 +101,8 @@ class Transitions:
 
     def check_range(self, n_states: int, n_actions: int) -> None:
         """Raise InputError naming the first tuple with a state or action out of range."""
+        checks.at_least("n_states", n_states, 1)
+        checks.at_least("n_actions", n_actions, 1)
         for name, bound in (("s", n_states), ("a", n_actions), ("s_next", n_states), ("a_next", n_actions)):
             column = getattr(self, name)
             if column.max() >= bound:

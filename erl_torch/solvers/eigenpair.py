@@ -70,7 +70,9 @@ def perron(matrix: Any, rtol: float = 1e-13, max_steps: int = 60) -> PerronPair:
     bad = np.flatnonzero(~((m.data >= 0) & (m.data <= LARGEST_ENTRY)))
     if bad.size:
         row = int(np.searchsorted(m.indptr, bad[0], side="right")) - 1
-        raise InputError(f"matrix[{row}, {m.indices[bad[0]]}]", m.data[bad[0]], f"finite and >= 0, at most {LARGEST_ENTRY:g}")
+        raise InputError(
+            f"matrix[{row}, {m.indices[bad[0]]}]", m.data[bad[0]], f"finite and >= 0, at most {LARGEST_ENTRY:g}"
+        )
     label, closed = classes(m)
     if len(closed) > 1 or m.nnz == 0:
         sizes = np.bincount(label)
