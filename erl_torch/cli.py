@@ -24,11 +24,11 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, OverrideParseException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import OmegaConfBaseException, ValidationError
 
 from erl_torch import sweeps
 from erl_torch.checks import InputError, out_of_memory
-from erl_torch.config import register
+from erl_torch.config import SCHEMAS, allowed, register
 from erl_torch.files import alone, began_with, write_bytes
 from erl_torch.output import lasting
 
@@ -206,6 +206,11 @@ def run(main: Callable[[], Any], about: str, conf: Path, config_name: str) -> No
             if argument.startswith("resume="):
                 directory = Path(argument.removeprefix("resume="))
                 _same_modules(directory, arguments, [a for a in typed if a != argument], conf, config_name)
+        for argument in arguments:
+            group, _, value = argument.partition("=")
+            if group in SCHEMAS and re.fullmatch(r"[-+.\d].*|true|false|null", value, re.IGNORECASE):
+                options = sorted(path.stem for path in (conf / group).glob("*.yaml"))
+                raise InputError(group, value, " or ".join(options))  # Hydra has a bare ValueError for it
         if {"-h", "--help"} & set(arguments):
             print(_help(about, conf, config_name, [a for a in arguments if not a.startswith("-")]))
             return
@@ -307,7 +312,7 @@ def _explain(error: Exception) -> str:
     """One line out of the several of Hydra and OmegaConf: the override where it is named, then the reason."""
     reason = error.__cause__ if isinstance(error.__cause__, OmegaConfBaseException) else error
     said = str(reason)
-    choice = re.search(r"Could not find '(\S+)/([^'/]+)'\s+Available options in '[^']*':\n((?:\t\S+\n?)+)", said)
+    choice = re.search(r"Could not find '(\S+)/([^'/]*)'\s+Available options in '[^']*':\n((?:\t\S+\n?)+)", said)
     if choice:
         group, name, options = choice.groups()
         if group.startswith("hydra/") and name in sweeps.EXTRAS:
@@ -324,5 +329,11 @@ def _explain(error: Exception) -> str:
         names = [field.name for field in fields(schema) if field.name != "name"]
         given = next((a for a in sys.argv[1:] if a.lstrip("+~").startswith(f"{subject}=")), subject)
         return f"{given}: no such key; there are {', '.join(names)}"
+    given = next((a for a in sys.argv[1:] if a.startswith(str(subject))), str(subject))  # whole, if it has spaces
+    key, typed, value = given.partition("=")
+    key = key.lstrip("+~")
+    takes = allowed(key) if typed else None
+    if takes is not None and isinstance(reason, ValidationError):
+        return str(InputError(key, value, takes))
     text = " ".join(re.sub(r"\n\s*(full_key|object_type|reference_type)[:=][^\n]*", "", said).split())
     return f"{subject}: {text}" if subject and subject not in text else text

@@ -364,6 +364,33 @@ SCHEMAS: dict[str, dict[str, type]] = {
 }
 
 
+TOP = (Train, Compare, Reproduce, Play)
+FROM = {"seed": 0, "maze_seed": 0, "model_seed": 0, "n_traps": 0, "reference": 0, "replica": 0, "size": 5}  # others: 1
+KINDS = {
+    "float": "a number",
+    "bool": "true or false",
+    "str": "text",
+    "list[str]": "a list of names, [A,B]",
+    "dict[str, Any]": "settings by name, {KEY: VALUE}",
+    "dict[str, float]": "numbers by name, {KEY: VALUE}",
+}
+
+
+def allowed(key: str) -> str | None:
+    """What a dotted key takes, by its type; None where there is no such key, or it takes anything."""
+    group, _, rest = key.rpartition(".")
+    schemas: list[type] = list(TOP)
+    if group:
+        schemas = [Suggest] if group.endswith(".suggest") else list(SCHEMAS.get(group.split(".")[0], {}).values())
+    for schema in schemas:
+        for item in fields(schema):
+            if item.name == (rest or key):
+                kind, _, optional = str(item.type).partition(" | ")
+                said = f"a whole number >= {FROM.get(item.name, 1)}, in digits" if kind == "int" else KINDS.get(kind)
+                return said and said + (", or null" if optional else "")
+    return KINDS["float"] if group and allowed(group) == KINDS["dict[str, float]"] else None
+
+
 def slug(text: Any) -> str:
     """``text`` as part of a file name: no separators, nothing a shell would touch."""
     return re.sub(r"[^A-Za-z0-9_.=+]+", "-", str(text)).strip("-.") or "run"

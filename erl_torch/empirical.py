@@ -55,7 +55,7 @@ class EmpiricalMDP:
         Raises:
             InputError: beta or prior out of range, or no state that is ever returned to.
         """
-        checks.temperature("beta", beta)
+        beta = checks.temperature("beta", beta)
         prior = check_prior("prior_policy", prior_policy, self.n_states, self.n_actions)
         used, entries, message, reducible = self._part()
         inside = used.any(1)
@@ -155,6 +155,7 @@ def tally(data: Recording, n_states: int, n_actions: int, lr_psi: float = 0.0) -
     Raises:
         InputError: naming the first tuple with a state or action out of range.
     """
+    checks.instance("transitions", data, Recording, "a recording, as of Transitions or open_recording")
     data.check_range(n_states, n_actions)
     n_pairs = n_states * n_actions
     if n_pairs > np.iinfo(np.int32).max:

@@ -13,11 +13,12 @@ import gymnasium as gym
 import numpy as np
 import scipy.sparse as sp
 
-from erl_torch import certificates, chains, kernels
+from erl_torch import certificates, chains, checks, kernels
 from erl_torch.certificates import one_step_worth, policy_gains
 from erl_torch.chains import GTH_STATES, classes, long_run
+from erl_torch.checks import InputError
 from erl_torch.experience import batched, reset
-from erl_torch.mdp import TabularMDP, check_policy
+from erl_torch.mdp import TabularMDP, check_policy, check_prior
 from erl_torch.models import known_mdp, sizes
 from erl_torch.rng import Streams
 from erl_torch.sampling import policy_cdf, sampling_tables
@@ -104,15 +105,26 @@ def evaluate(
         policy: [S, A].
         beta: inverse temperature, 1/reward.
         rng: draws the episodes.
-        n_episodes: episodes behind ``mean_return``.
-        horizon: steps of an episode, and of the exact reward per step.
-        prior_policy: [S, A]; None is uniform.
+        n_episodes: whole number >= 1, episodes behind ``mean_return``.
+        horizon: whole number >= 1, steps of an episode, and of the exact reward per step.
+        prior_policy: [S, A], entries > 0; None is uniform.
         mdp: the model behind reward per step and objective; None is ``known_mdp(source)``.
         mean_return: finds the mean return of a policy [S, A], in place of episodes played in ``source``.
+
+    Raises:
+        InputError: an argument out of range, a policy or prior that is not [S, A], or a model of other sizes.
     """
+    beta = checks.temperature("beta", beta)
+    n_episodes, horizon = checks.at_least("n_episodes", n_episodes, 1), checks.at_least("horizon", horizon, 1)
+    checks.memory("n_episodes", n_episodes, 8 * n_episodes, "the returns of all episodes")
+    checks.instance("rng", rng, np.random.Generator, "a generator, as numpy.random.default_rng(0)")
     n_states, n_actions = sizes(source)
+    if mdp is not None:
+        checks.instance("mdp", mdp, TabularMDP, "a TabularMDP")
+        if mdp.reward.shape != (n_states, n_actions):
+            raise InputError("mdp", f"MDP of shape {mdp.reward.shape}", f"of shape [{n_states}, {n_actions}]")
     table = check_policy("policy", policy, n_states, n_actions)
-    prior = check_policy("prior_policy", prior_policy, n_states, n_actions)
+    prior = check_prior("prior_policy", prior_policy, n_states, n_actions)
     known = known_mdp(source)
     model = known if mdp is None else mdp
     endless = isinstance(source, TabularMDP) or not getattr(source.unwrapped, "ends", np.zeros(1)).any()

@@ -64,8 +64,8 @@ def collect(
     Raises:
         InputError: an argument out of range, or spaces that are not Discrete.
     """
-    checks.at_least("n_episodes", n_episodes, 1)
-    checks.at_least("episode_length", episode_length, 1)
+    n_episodes = checks.at_least("n_episodes", n_episodes, 1)
+    episode_length = checks.at_least("episode_length", episode_length, 1)
     n_states, n_actions = sizes(source)
     prior = check_policy("prior_policy", prior_policy, n_states, n_actions)
     on_prior = behaviour_policy is None
@@ -141,13 +141,13 @@ def record(
     Raises:
         InputError: as ``collect``; a directory that holds anything else.
     """
+    n_states, n_actions = sizes(source)
     mdp = known_mdp(source)
     if mdp is None and not isinstance(source, (TabularMDP, gym.vector.VectorEnv)) and batched(source):
         data = collect(source, n_episodes, episode_length, seed, behaviour_policy, prior_policy, report)
         return save_columns(data, directory)
-    checks.at_least("n_episodes", n_episodes, 1)
-    checks.at_least("episode_length", episode_length, 1)
-    n_states, n_actions = sizes(source)
+    n_episodes = checks.at_least("n_episodes", n_episodes, 1)
+    episode_length = checks.at_least("episode_length", episode_length, 1)
     prior = check_policy("prior_policy", prior_policy, n_states, n_actions)
     on_prior = behaviour_policy is None
     behaviour = prior if on_prior else check_policy("behaviour_policy", behaviour_policy, n_states, n_actions)

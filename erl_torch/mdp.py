@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from erl_torch import kernels
+from erl_torch import checks, kernels
 from erl_torch.checks import InputError
 from erl_torch.files import read_npz, write_npz
 from erl_torch.notes import note
@@ -25,16 +25,17 @@ AS_GIVEN = 1e-15  # rows whose sums are this close to 1 keep their bits
 WORTH_A_NOTE = 1e-9
 SMALLEST_PRIOR = 1e-307
 LARGEST_REWARD = 1e100  # products of such numbers stay in range
+REWARDS = (lambda r: np.abs(r) <= LARGEST_REWARD, f"finite, and at most {LARGEST_REWARD:g} in size")
 CSR_PARTS = ("indptr", "indices", "data")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class TabularMDP:
     """A validated finite MDP.
 
     Args:
-        transition: p(s'|s, a) as a scipy or torch sparse matrix or a dense array, [S*A, S] or [S, A, S];
-            repeated entries are summed.
+        transition: p(s'|s, a), [S*A, S] or [S, A, S], as any array of real numbers (lists, numpy, torch), or, [S*A, S],
+            as a sparse one (scipy, torch); repeated entries are summed.
         reward: [S, A], reward a step.
         start: [S], distribution of the first state; None is uniform.
         normalise: divide every row, and start, by its sum, whatever that is.
@@ -43,8 +44,8 @@ class TabularMDP:
     are the rows as they stand in ``transition``. A ``Note`` names the largest correction above 1e-9.
 
     Raises:
-        InputError: wrong shape, an index out of range, a value that is not finite or negative, a row that does not
-            sum to 1 within 1e-5, or to 0 with ``normalise`` (the row is named).
+        InputError: no real numbers, wrong shape, an index out of range, a value that is not finite or negative, a row
+            that does not sum to 1 within 1e-5, or to 0 with ``normalise`` (the row is named).
     """
 
     transition: sp.csr_array  # [S*A, S], float64, sorted, no repeated or zero entries
@@ -53,22 +54,14 @@ class TabularMDP:
     normalise: InitVar[bool] = False
 
     def __post_init__(self, normalise: bool) -> None:
-        reward = _dense("reward", self.reward).copy()
-        if reward.ndim != 2 or 0 in reward.shape:
-            raise InputError("reward", f"array of shape {reward.shape}", "of shape [n_states, n_actions]")
+        reward = checks.array("reward", self.reward, ("n_states", "n_actions"), REWARDS)
         n_states, n_actions = reward.shape
-        usable = np.abs(reward) <= LARGEST_REWARD  # false for NaN
-        if not usable.all():
-            s, a = np.argwhere(~usable)[0]
-            raise InputError(f"reward[{s}, {a}]", reward[s, a], f"finite, and at most {LARGEST_REWARD:g} in size")
         transition = _csr(self.transition, n_states, n_actions)
         _check_entries(transition, n_actions)
-        start = np.full(n_states, 1.0 / n_states) if self.start is None else _dense("start", self.start).copy()
-        if start.shape != (n_states,):
-            raise InputError("start", f"array of shape {start.shape}", f"of shape [{n_states}]")
-        if not (np.isfinite(start).all() and (start >= 0).all()):
-            raise InputError("start", "array", "finite and >= 0 everywhere")
-        tolerance = np.inf if normalise else ROW_SUM_TOLERANCE
+        start = np.full(n_states, 1.0 / n_states)
+        if self.start is not None:
+            start = checks.array("start", self.start, (n_states,), checks.NOT_NEGATIVE)
+        tolerance = np.inf if checks.flag("normalise", normalise) else ROW_SUM_TOLERANCE
         largest = max(
             normalise_rows(lambda row: _row_name(row, n_actions), transition.indptr, transition.data, tolerance),
             normalise_rows(lambda row: "start", np.array([0, n_states]), start, tolerance),
@@ -77,6 +70,11 @@ class TabularMDP:
         object.__setattr__(self, "transition", transition)
         object.__setattr__(self, "reward", reward)
         object.__setattr__(self, "start", start)
+
+    def __repr__(self) -> str:
+        low, high = self.reward.min(), self.reward.max()
+        parts = (f"{self.n_states} states", f"{self.n_actions} actions", f"{self.transition.nnz} transitions")
+        return f"TabularMDP({', '.join(parts)}, rewards in [{low:g}, {high:g}])"
 
     @property
     def n_states(self) -> int:
@@ -105,7 +103,7 @@ class TabularMDP:
                 transition = _csr_of_parts([arrays[part] for part in parts], arrays["reward"].shape)
             return cls(transition, arrays["reward"], arrays.get("start"), normalise)  # type: ignore[arg-type]
         except InputError as error:
-            raise InputError(f"{path}: {error.key}", error.value, error.allowed) from error
+            raise error.of_file(path) from error
 
 
 def check_policy(key: str, policy: Any, n_states: int, n_actions: int) -> np.ndarray:
@@ -113,14 +111,11 @@ def check_policy(key: str, policy: Any, n_states: int, n_actions: int) -> np.nda
 
     Raises InputError naming ``key``.
     """
+    n_states, n_actions = checks.at_least("n_states", n_states, 1), checks.at_least("n_actions", n_actions, 1)
     if policy is None:
+        checks.room("n_states * n_actions", (n_states, n_actions))
         return np.full((n_states, n_actions), 1.0 / n_actions)
-    table = _dense(key, policy)
-    if table.shape != (n_states, n_actions):
-        raise InputError(key, f"array of shape {table.shape}", f"of shape [{n_states}, {n_actions}]")
-    if not (np.isfinite(table).all() and (table >= 0).all()):
-        raise InputError(key, "array", "finite and >= 0 everywhere")
-    table = table.copy()
+    table = checks.array(key, policy, (n_states, n_actions), checks.NOT_NEGATIVE)
     rows = np.arange(n_states + 1) * n_actions
     _say_corrected(f"rows of {key}", normalise_rows(lambda row: f"{key}[{row}]", rows, table.reshape(-1)))
     return table
@@ -167,15 +162,6 @@ def _say_corrected(what: str, largest: float) -> None:
         note(f"{what} did not sum to 1, by up to {largest:.1e}: they were divided by their sums")
 
 
-def _dense(key: str, value: Any) -> np.ndarray:
-    if hasattr(value, "detach"):
-        value = value.detach().cpu().numpy()
-    try:
-        return np.ascontiguousarray(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(key, type(value).__name__, "an array of numbers") from error
-
-
 def _csr_of_parts(parts: Sequence[np.ndarray], sizes: tuple[int, ...]) -> sp.csr_array:
     indptr, indices, data = parts
     if len(sizes) != 2:
@@ -189,54 +175,12 @@ def _csr_of_parts(parts: Sequence[np.ndarray], sizes: tuple[int, ...]) -> sp.csr
 
 
 def _csr(value: Any, n_states: int, n_actions: int) -> sp.csr_array:
-    if hasattr(value, "layout") and hasattr(value, "to_sparse_coo"):  # a torch tensor
-        value = _scipy(value.detach().cpu())
-    if not sp.issparse(value):
-        value = _dense("transition", value)
+    shape = (n_states * n_actions, n_states)
+    if not checks.is_sparse(value):
+        value = checks.real("transition", value)
         if value.shape == (n_states, n_actions, n_states):
-            value = value.reshape(n_states * n_actions, n_states)
-    if value.shape != (n_states * n_actions, n_states):
-        raise InputError(
-            "transition",
-            f"array of shape {tuple(value.shape)}",
-            f"of shape [{n_states * n_actions}, {n_states}] to go with reward [{n_states}, {n_actions}]",
-        )
-    try:
-        # Before anything is converted: conversions and compiled loops trust the indices.
-        if sp.issparse(value) and hasattr(value, "check_format"):
-            value.check_format(full_check=True)
-        elif sp.issparse(value) and value.format == "coo":
-            value = sp.coo_array((value.data, value.coords), shape=value.shape)
-        csr = sp.csr_array(value, dtype=np.float64, copy=True)
-        csr.check_format(full_check=True)
-    except (ValueError, TypeError, IndexError) as error:
-        raise InputError("transition", "sparse matrix", f"a matrix [S*A, S] with indices in range ({error})") from error
-    csr.sum_duplicates()
-    csr.eliminate_zeros()
-    csr.sort_indices()
-    return csr
-
-
-def _scipy(value: Any) -> Any:
-    """A torch tensor as an array, or as a sparse one where it is."""
-    import torch
-
-    if value.layout is torch.strided:
-        return value
-    try:
-        if value.layout is not torch.sparse_coo:  # torch does not look at these indices by itself
-            by_row = value.layout in (torch.sparse_csr, torch.sparse_bsr)
-            parts = (
-                (value.crow_indices(), value.col_indices()) if by_row else (value.ccol_indices(), value.row_indices())
-            )
-            torch.sparse_compressed_tensor(
-                *parts, value.values(), value.shape, layout=value.layout, check_invariants=True
-            )
-        value = value.to_sparse_coo().coalesce()
-        return sp.coo_array((value.values().numpy(), tuple(value.indices().numpy())), shape=tuple(value.shape))
-    except (ValueError, RuntimeError) as error:
-        said = str(error).splitlines()[0][:120]
-        raise InputError("transition", "sparse tensor", f"a matrix [S*A, S] with indices in range ({said})") from error
+            value = value.reshape(shape)
+    return checks.sparse("transition", value, shape, f" to go with reward [{n_states}, {n_actions}]")
 
 
 def _row_name(row: int, n_actions: int) -> str:

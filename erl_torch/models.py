@@ -28,7 +28,7 @@ from gymnasium import wrappers
 
 from erl_torch import checks
 from erl_torch.checks import InputError
-from erl_torch.mdp import TabularMDP
+from erl_torch.mdp import TabularMDP, normalise_rows
 
 # Wrappers that leave states, actions, rewards and dynamics as they are.
 NEUTRAL = (
@@ -53,6 +53,8 @@ def sizes(source: TabularMDP | gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any
         return source.n_states, source.n_actions
     single = "single_" if isinstance(source, gym.vector.VectorEnv) else ""
     spaces = []
+    allowed = "a TabularMDP, or an environment of Gymnasium's"
+    checks.instance("source", source, (gym.Env, gym.vector.VectorEnv), allowed)
     for name in ("observation_space", "action_space"):
         space = getattr(source, single + name)
         if not isinstance(space, gym.spaces.Discrete) or space.start != 0:
@@ -88,6 +90,7 @@ def tabular_mdp(env: gym.Env[Any, Any], on_end: str = "restart", start: Any = No
         MeanRewardWarning: rewards depend on s'.
     """
     checks.one_of("on_end", on_end, ("restart", "absorb"))
+    checks.instance("env", env, gym.Env, "an environment of Gymnasium's")
     changed = changed_by(env)
     if changed is not None:
         raise InputError("env", env, f"without {changed}, under which the model is not known")
@@ -174,10 +177,9 @@ def _start(base: Any, start: Any, n_states: int) -> np.ndarray:
         start = getattr(base, "initial_state_distrib", getattr(base, "isd", None))
     if start is None:
         raise InputError("start", None, "given: the environment does not tell its start distribution")
-    start = np.asarray(start, np.float64)
-    if start.shape != (n_states,):
-        raise InputError("start", f"array of shape {start.shape}", f"of shape [{n_states}]")
-    return np.asarray(start / start.sum())
+    found = checks.array("start", start, (n_states,), checks.NOT_NEGATIVE)
+    normalise_rows(lambda row: "start", np.array([0, n_states]), found, np.inf)
+    return found
 
 
 def _absorbed(mdp: TabularMDP, states: np.ndarray, reward: np.ndarray) -> TabularMDP:

@@ -93,7 +93,9 @@ class FileRecording:
         report: Callable[[int], object] | None = None,
     ) -> None:
         checks.one_of("on_bad", on_bad, ("stop", "skip"))
-        checks.at_least("chunk", chunk, 1)
+        chunk = checks.at_least("chunk", chunk, 1)
+        n_states, n_actions = checks.at_least("n_states", n_states, 1), checks.at_least("n_actions", n_actions, 1)
+        checks.instance("path", path, (str, os.PathLike), "a path")
         if n_states * n_actions > np.iinfo(np.int32).max:
             raise InputError("n_states * n_actions", n_states * n_actions, "below 2**31")
         self._source: Source
@@ -559,6 +561,7 @@ def _our_npz(path: Path) -> bool:
 
 def save_columns(data: Recording, directory: str | os.PathLike[str]) -> Path:
     """Write a recording of any size to a directory of columns, which is the fastest to read."""
+    checks.instance("data", data, Recording, "a recording, as of Transitions or open_recording")
     with ColumnWriter(directory) as writer:
         for chunk in data.chunks():
             writer.append(chunk)

@@ -6,6 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from erl_torch import checks
+
 
 class Streams(NamedTuple):
     """One generator a purpose, so that more evaluation never changes the experience."""
@@ -16,6 +18,6 @@ class Streams(NamedTuple):
 
 
 def streams(seed: int) -> Streams:
-    """The named streams of ``seed`` (a whole number >= 0)."""
-    children = np.random.SeedSequence(seed).spawn(len(Streams._fields))
+    """The named streams of ``seed``, a whole number >= 0. Raises InputError."""
+    children = np.random.SeedSequence(checks.at_least("seed", seed, 0)).spawn(len(Streams._fields))
     return Streams(*(np.random.default_rng(child) for child in children))

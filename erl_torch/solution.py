@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import enum
+import math
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, dataclass, field, fields
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
 from pathlib import Path
 from typing import Any
@@ -13,8 +14,12 @@ from typing import Any
 import numpy as np
 import torch
 
+from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.files import read_npz, write_npz
+from erl_torch.mdp import check_policy
+
+NO_NAN: checks.Entries = (lambda x: ~np.isnan(x), "a number")
 
 
 class Status(enum.Enum):
@@ -91,14 +96,17 @@ class Solution:
         """(Q [S, A], V [S]) of equations (1) and (2) for trajectories of ``n_steps``; reward, up to a constant.
 
         Q = -theta N + log(u)/beta, V = -theta N + log(sum_a prior u)/beta.
+
+        Raises InputError for ``n_steps`` < 0, or above 0 where the solution has no theta, or no beta.
         """
+        n_steps = checks.at_least("n_steps", n_steps, 0)
         if self.theta is None and n_steps:
-            raise ValueError("value_functions needs theta, which this solution does not carry")
+            raise InputError("n_steps", n_steps, "0: this solution has no theta")
         total = self.theta * n_steps if self.theta is not None else 0.0
         if self.action_value is not None and self.value is not None:
             return self.action_value - total, self.value - total
         if self.beta is None:
-            raise ValueError("value_functions needs beta, which this solution does not carry")
+            raise InputError("beta", None, "known: this solution has none, so that u has no unit of reward")
         return self.u.log() / self.beta - total, -self.psi.log() / self.beta - total
 
     @classmethod
@@ -146,23 +154,86 @@ class Solution:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Solution:
-        """Read what ``save`` wrote. Raises InputError naming the file."""
+        """Read what ``save`` wrote. Raises InputError naming the file, and what in it is not as ``save`` writes it."""
         return cls.of_arrays(read_npz(path), path)
 
     @classmethod
     def of_arrays(cls, arrays: Mapping[str, np.ndarray], path: str | os.PathLike[str]) -> Solution:
-        """The solution of ``arrays``, read from ``path``. Raises InputError naming the file."""
+        """The solution of ``arrays``, read from ``path``. Raises InputError as ``load``."""
         values: dict[str, Any] = {"history": {}}
+        readers = _readers()
         try:
             for name, array in arrays.items():
                 if name.startswith("history/"):
-                    values["history"][name.removeprefix("history/")] = array
-                elif name == "theta_bounds":
-                    values[name] = (float(array[0]), float(array[1]))
-                elif array.ndim:
-                    values[name] = torch.from_numpy(array)
+                    values["history"][name.removeprefix("history/")] = _curve(name, array)
+                elif name in readers:
+                    values[name] = readers[name](name, array)
                 else:
-                    values[name] = array.item()
-            return cls(**(values | {"status": Status[values["status"]]}))
-        except (IndexError, KeyError, TypeError, ValueError) as error:
-            raise InputError("path", path, f"a solution as Solution.save writes it ({error})") from error
+                    raise InputError(name, f"array of shape {array.shape}", "left out: a Solution has no such array")
+            for item in fields(cls):
+                if item.name not in values and item.default is MISSING:
+                    raise InputError(item.name, None, "there, as Solution.save writes it")
+            sizes = values["policy"].shape
+            for name, table in values.items():
+                if isinstance(table, torch.Tensor) and table.shape != sizes[: table.ndim]:
+                    allowed = f"of shape {list(sizes[: table.ndim])}, to go with the policy"
+                    raise InputError(name, f"array of shape {tuple(table.shape)}", allowed)
+        except InputError as error:
+            raise error.of_file(path) from error
+        return cls(**values)
+
+
+def _readers() -> dict[str, Callable[[str, np.ndarray], Any]]:
+    """What each array of a saved solution becomes."""
+
+    def table(*shape: str) -> Callable[[str, np.ndarray], Any]:
+        return lambda name, found: torch.from_numpy(checks.array(name, found, shape, NO_NAN))
+
+    def number(fits: Callable[[float], bool], allowed: str) -> Callable[[str, np.ndarray], float]:
+        return lambda name, found: checks.number(name, _single(name, found), fits, allowed)
+
+    def count(name: str, found: np.ndarray) -> int:
+        return checks.at_least(name, _single(name, found), 0)
+
+    def policy(name: str, found: np.ndarray) -> torch.Tensor:
+        kept = checks.array(name, found, ("n_states", "n_actions"), checks.NOT_NEGATIVE)
+        check_policy(name, kept, *kept.shape)
+        return torch.from_numpy(kept)
+
+    def status(name: str, found: np.ndarray) -> Status:
+        said = _single(name, found)
+        checks.one_of(name, said, tuple(Status.__members__))
+        return Status[said]
+
+    def message(name: str, found: np.ndarray) -> str:
+        said = _single(name, found)
+        checks.instance(name, said, str, "text")
+        return str(said)
+
+    def bounds(name: str, found: np.ndarray) -> tuple[float, float]:
+        low, high = checks.array(name, found, (2,), NO_NAN).tolist()
+        if low > high:
+            raise InputError(name, (low, high), "in order")
+        return low, high
+
+    pair, state = table("n_states", "n_actions"), table("n_states")
+    finite = number(math.isfinite, "a finite number")
+    not_negative = number(lambda x: x >= 0, "a number >= 0")
+    return {
+        "policy": policy, "u": pair, "psi": state, "reward_bias": pair, "value": state, "action_value": pair,
+        "rho": not_negative, "theta": finite, "reward_bias_max": not_negative, "gap": not_negative,
+        "beta": number(lambda x: 0 < x < math.inf, "a finite number > 0"), "n_steps": count, "k": count,
+        "status": status, "message": message, "theta_bounds": bounds,
+    }  # fmt: skip
+
+
+def _single(name: str, found: np.ndarray) -> Any:
+    if found.ndim:
+        raise InputError(name, f"array of shape {found.shape}", "a single value")
+    return found.item()
+
+
+def _curve(name: str, found: np.ndarray) -> np.ndarray:
+    if found.ndim == 0 or found.dtype.kind not in checks.REAL:
+        raise InputError(name, f"array of shape {found.shape} and dtype {found.dtype}", "numbers, one entry an epoch")
+    return found

@@ -11,10 +11,11 @@ import zlib
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
+from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.files import read_npz, write_npz
 
@@ -22,6 +23,7 @@ COLUMNS = ("s", "a", "r", "s_next", "a_next")
 Part = TypeVar("Part")
 
 
+@runtime_checkable
 class Recording(Protocol):
     """A stream of tuples of any size, the same in every pass."""
 
@@ -99,6 +101,8 @@ class Transitions:
 
     def check_range(self, n_states: int, n_actions: int) -> None:
         """Raise InputError naming the first tuple with a state or action out of range."""
+        checks.at_least("n_states", n_states, 1)
+        checks.at_least("n_actions", n_actions, 1)
         for name, bound in (("s", n_states), ("a", n_actions), ("s_next", n_states), ("a_next", n_actions)):
             column = getattr(self, name)
             if column.max() >= bound:
@@ -122,7 +126,7 @@ class Transitions:
         try:
             return cls(**{name: arrays[name] for name in COLUMNS})
         except InputError as error:
-            raise InputError(f"{path}: {error.key}", error.value, error.allowed) from error
+            raise error.of_file(path) from error
 
 
 class Checksum:
@@ -209,13 +213,11 @@ def tuple_at(data: Recording, t: int) -> tuple[int, int, float]:
 
 
 def _column(name: str, value: Any) -> np.ndarray:
-    if hasattr(value, "detach"):
-        value = value.detach().cpu().numpy()
-    column = np.asarray(value)
+    column = checks.real(name, value)
     if column.ndim != 1:
         raise InputError(name, f"array of shape {column.shape}", "one-dimensional")
     if name == "r":
-        if column.dtype.kind not in "iuf":
+        if column.dtype.kind == "b":
             raise InputError(name, f"dtype {column.dtype}", "an array of numbers")
         column = np.ascontiguousarray(column, dtype=np.float64)
         if not np.isfinite(column).all():

@@ -79,8 +79,7 @@ class Estimate:
         (value - T)^2 <= t^2 (se^2 + (third/se^2) (T - value)), t of Student's distribution. For a count of rare events
         that is Wilson's; without skewness value -+ t se. What was never tried comes on top.
         """
-        if not 0 < level < 1:
-            raise InputError("level", level, "a number in (0, 1)")
+        level = checks.number("level", level, lambda x: 0 < x < 1, "a number in (0, 1)")
         if self.withheld:
             return -np.inf, np.inf
         if self.samples is not None:
@@ -94,6 +93,7 @@ class Estimate:
 
     def next_samples(self, n: int = 5) -> list[tuple[int, int, float]]:
         """The n pairs (s, a, drop of the variance by one more sample), best first. Plug-in estimates only."""
+        n = checks.at_least("n", n, 1)
         if self.variance is None or self.visits is None:
             raise InputError("next_samples", "bootstrap", "asked of a plug-in estimate")
         drop = self.variance / (self.visits + 1)
@@ -191,6 +191,7 @@ def bootstrap_theta(
     Raises:
         InputError: an argument out of range, or fewer than two samples that can be solved.
     """
+    seed = checks.seed("seed", seed)
     checks.at_least("n_resamples", n_resamples, 2)
     rng = np.random.default_rng(seed)
     part = model.problem(beta, prior_policy)

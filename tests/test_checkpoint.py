@@ -476,3 +476,50 @@ def test_input_that_shows_as_bad_once_learning_begins_leaves_nothing(tmp_path, r
     with pytest.raises(InputError, match="transitions=a stream that never returns to any state"):
         train(cfg, tmp_path)
     assert not any(tmp_path.iterdir())
+
+
+def test_a_checkpoint_that_cannot_be_reached_stays(tmp_path, capsys):
+    """... as on a disk that is not mounted: it may be whole. A damaged one goes."""
+    saved = Checkpoints(tmp_path, {}, 0.0)
+    for step in (1, 2):
+        saved.offer(step, lambda: {"n": step})  # noqa: B023 (called at once)
+    _, newest = sorted((tmp_path / "checkpoints").iterdir())
+    newest.unlink()
+    newest.symlink_to(tmp_path / "not mounted")
+    assert saved.read() == {"n": 1}
+    assert newest.is_symlink()
+    newest.unlink()
+    newest.write_bytes(b"damaged")
+    assert saved.read() == {"n": 1}
+    assert not newest.exists()
+    assert capsys.readouterr().err.count(f"warning: {newest} cannot be read") == 2
+
+
+def test_leftovers_of_a_killed_run_go(tmp_path):
+    saved = Checkpoints(tmp_path, {}, 0.0)
+    saved.offer(1, lambda: {"n": 1})
+    leftovers = [tmp_path / ".solution.npz.99.tmp", tmp_path / "checkpoints" / ".x.ckpt.99.tmp"]
+    for path in (*leftovers, tmp_path / "mine.tmp"):
+        path.write_bytes(b"half")
+    assert saved.read() == {"n": 1}
+    assert all(path.exists() for path in leftovers)  # whoever only looks takes nothing away
+    assert saved.start() == {"n": 1}
+    assert not any(path.exists() for path in leftovers)
+    assert (tmp_path / "mine.tmp").exists()
+
+
+@pytest.mark.parametrize("learnt", [True, False])
+def test_bad_input_takes_nothing_away_that_was_learnt(tmp_path, learnt):
+    saved = Checkpoints(tmp_path, {}, 0.0)
+    saved.start()
+    saved.offer(1, lambda: {"n": 1})
+    EventFile(tmp_path).close()
+    with pytest.raises(InputError), saved.refusing(lambda: learnt):
+        raise InputError("x", 1, "another")
+    assert (tmp_path / "settings.json").exists() is learnt
+    assert (tmp_path / "checkpoints").exists() is learnt
+    assert bool(list(tmp_path.glob("events.*"))) is learnt
+    (tmp_path / "settings.json").touch()
+    with pytest.raises(ZeroDivisionError), saved.refusing(lambda: False):
+        raise ZeroDivisionError
+    assert (tmp_path / "settings.json").exists()

@@ -193,11 +193,13 @@ def test_free_memory_is_within_the_process_s_own_limit():
 
 
 def test_counts_are_whole_numbers_of_64_bits():
-    for value in (math.nan, math.inf, -1, 0.5, True, "3", None, 2**63, 10**5000):
+    for value in (math.nan, math.inf, -1, 0.5, 3.0, True, "3", None, 2**63, 10**5000):
         with pytest.raises(InputError, match=r"^n=.*: must be (a whole number >= 0|below 2\*\*63)$"):
             checks.at_least("n", value, 0)
-    for good in (0, 3.0, np.int32(5), 2**63 - 1):
-        checks.at_least("n", good, 0)
+    for good in (0, np.int32(5), 2**63 - 1):
+        found = checks.at_least("n", good, 0)
+        assert found == good
+        assert type(found) is int
 
 
 @pytest.mark.parametrize(
@@ -240,6 +242,16 @@ def test_unknown_keys_get_one_line(tmp_path, group, plus):
         (["env=gym", "env.id=CartPole-v1"], "observation_space=Box"),
         (["env=gym", "env.id=FrozenLake-v1", "++env.kwargs.ice=3"], "env.kwargs={'ice': 3}: must be arguments of"),
         (["learner.beta=1000"], "learner.beta=1000.0: must be below 745"),
+        (["n_replicas=2.5"], "n_replicas=2.5: must be a whole number >= 1, in digits"),
+        (["seed=abc"], "seed=abc: must be a whole number >= 0, in digits"),
+        (["experience.n_episodes=1e15"], "experience.n_episodes=1e15: must be a whole number >= 1, in digits"),
+        (["++learner.n_epochs=1.5"], "learner.n_epochs=1.5: must be a whole number >= 1, in digits"),
+        (["learner.lr_rho=x"], "learner.lr_rho=x: must be a number, or null"),
+        (["learner.clip_rho=maybe"], "learner.clip_rho=maybe: must be true or false"),
+        (["env.suggest.beta=x"], "env.suggest.beta=x: must be a number"),
+        (["++vary.beta=[]"], "vary.beta=[]: must be a list of numbers"),
+        (["env=mdp", "env.path=nothere.npz"], "env.path=nothere.npz: must be a readable npz file"),
+        (["experience=recorded", "experience.path=nothere.npz"], "experience.path=nothere.npz: must be there"),
     ],
 )
 def test_other_complaints(tmp_path, overrides, expected):

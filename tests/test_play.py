@@ -4,10 +4,12 @@ import contextlib
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from PIL import Image
@@ -30,8 +32,11 @@ def arguments(*overrides):
 def copy(template, run, policy, *overrides):
     """A run directory like ``template``, with a policy and settings of our own."""
     run.mkdir()
-    arrays = Solution.load(template / "solution.npz").arrays(history=False)
-    np.savez(run / "solution.npz", **arrays | {"policy": policy})
+    policy = torch.as_tensor(policy)
+    table, ones = torch.ones(policy.shape), torch.ones(len(policy))
+    tables = {"u": table, "psi": ones, "reward_bias": 0 * table, "value": None, "action_value": None}
+    solution = Solution.load(template / "solution.npz")
+    replace(solution, policy=policy, **tables).save(run / "solution.npz")
     (run / ".hydra").mkdir()
     OmegaConf.save(composed(*overrides), run / ".hydra" / "config.yaml")
     return run

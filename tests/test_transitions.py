@@ -46,7 +46,7 @@ def test_loads_any_npz_with_the_columns(authors, authors_tuples):
         ({"s": [0, 2**31, 2]}, r"s\[1\]=2147483648"),
         ({"a": [0.5, 1.0, 0.0]}, r"a=dtype float64: must be an array of whole numbers"),
         ({"r": [0.0, np.nan, 0.0]}, r"r\[1\]=nan: must be finite"),
-        ({"r": ["a", "b", "c"]}, r"r=dtype <U1: must be an array of numbers"),
+        ({"r": ["a", "b", "c"]}, r"r=list of dtype <U1: must be an array of real numbers"),
         ({"s_next": [0, 1]}, r"columns=lengths .*'s_next': 2.*: must be of one length"),
         ({"a_next": [[0, 1, 2]]}, r"a_next=array of shape \(1, 3\): must be one-dimensional"),
         ({name: [] for name in COLUMNS}, r"transitions=0 tuples: must be at least one tuple"),

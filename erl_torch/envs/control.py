@@ -88,9 +88,9 @@ class ControlTask:
         """The bins asked for; None is the task's own. Raises InputError as ``UniformBins`` does."""
         sizes: Any = [bins] * len(self.bins) if bins is not None and np.ndim(bins) == 0 else bins
         parts = (
-            self.bins if sizes is None else tuple(sizes),
-            self.low if low is None else tuple(map(float, low)),
-            self.high if high is None else tuple(map(float, high)),
+            self.bins if sizes is None else checks.sequence("bins", sizes),
+            self.low if low is None else tuple(checks.array("low", low, (len(self.bins),)).tolist()),
+            self.high if high is None else tuple(checks.array("high", high, (len(self.bins),)).tolist()),
         )
         if len(parts[0]) != len(self.bins):
             raise InputError("bins", list(parts[0]), f"a whole number or {len(self.bins)} of them")
@@ -102,8 +102,8 @@ class ControlTask:
             return self.actions
         if self.max_action is None:
             raise InputError("actions", list(actions), f"left out: those of {self.gymnasium_id} are fixed")
-        values = tuple(actions)
-        good = all(checks.is_number(x) and math.isfinite(x) and abs(x) <= self.max_action for x in values)
+        values = checks.sequence("actions", actions)
+        good = all(checks.is_number(x) and abs(x) <= min(self.max_action, np.finfo(float).max) for x in values)
         if not values or not good:
             limit = f" of at most {self.max_action:g} in size" if math.isfinite(self.max_action) else ""
             raise InputError("actions", list(values), f"a list of finite numbers{limit}")

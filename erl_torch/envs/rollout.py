@@ -67,8 +67,8 @@ def rollout(
     """
     player = _Player(task, bins, actions, reward)
     table = check_policy("policy", policy, player.bins.n_cells, len(player.values))
-    checks.at_least("n_episodes", n_episodes, 1)
-    checks.at_least("max_steps", max_steps, 1)
+    n_episodes, max_steps = checks.at_least("n_episodes", n_episodes, 1), checks.at_least("max_steps", max_steps, 1)
+    checks.instance("rng", rng, np.random.Generator, "a generator, as numpy.random.default_rng(0)")
     returns, lengths = np.zeros(n_episodes), np.zeros(n_episodes, np.int64)
     state = player.task.initial(n_episodes, rng)
     for tick in player.play(state, table, None, max_steps, rng):
@@ -99,8 +99,8 @@ def collect_rollouts(
     """
     player = _Player(task, bins, actions, reward)
     n_states, n_actions = player.bins.n_cells, len(player.values)
-    checks.at_least("n_episodes", n_episodes, 1)
-    checks.at_least("episode_length", episode_length, 1)
+    n_episodes = checks.at_least("n_episodes", n_episodes, 1)
+    episode_length = checks.at_least("episode_length", episode_length, 1)
     prior = check_policy("prior_policy", prior_policy, n_states, n_actions)
     on_prior = behaviour_policy is None
     behaviour = prior if on_prior else check_policy("behaviour_policy", behaviour_policy, n_states, n_actions)

@@ -130,6 +130,7 @@ class ActionValueLearner:
         return self.exponential
 
     def __post_init__(self) -> None:
+        checks.plain(self)
         checks.temperature("beta", self.beta)
         if not (checks.is_number(self.power) and 0.5 < self.power <= 1):
             raise InputError("power", self.power, "a number in (0.5, 1]")

@@ -217,6 +217,7 @@ class AlgorithmS1:
     device: str = "cpu"
 
     def __post_init__(self) -> None:
+        checks.plain(self)
         checks.temperature("beta", self.beta)
         checks.step_size("lr_u", self.lr_u)
         if self.lr_rho is not None:

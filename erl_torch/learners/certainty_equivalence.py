@@ -92,6 +92,7 @@ class CertaintyEquivalence:
     prior_policy: torch.Tensor | np.ndarray | None = None
 
     def __post_init__(self) -> None:
+        checks.plain(self)
         checks.temperature("beta", self.beta)
         checks.positive("tol", self.tol)
         checks.at_least("max_steps", self.max_steps, 1)

@@ -311,6 +311,7 @@ class EfficientS1:
     unvisited: str = "exclude"
 
     def __post_init__(self) -> None:
+        checks.plain(self)
         checks.temperature("beta", self.beta)
         checks.step_size("lr_u", self.lr_u)
         if self.lr_rho is not None:

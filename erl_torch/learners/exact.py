@@ -71,6 +71,7 @@ class Exact:
     prior_policy: torch.Tensor | np.ndarray | None = None
 
     def __post_init__(self) -> None:
+        checks.plain(self)
         checks.temperature("beta", self.beta)
         checks.one_of("method", self.method, ("biasing", "soft_bellman"))
         checks.positive("tol", self.tol)

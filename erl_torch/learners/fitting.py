@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from erl_torch import checks
 from erl_torch.solution import Solution
 from erl_torch.transitions import Recording
 
@@ -27,6 +28,7 @@ def epochs(learner: Any, transitions: Recording, n_states: int, n_actions: int, 
 
     Raises what its ``step`` raises.
     """
+    checks.instance("transitions", transitions, Recording, "a recording, as of Transitions or open_recording")
     stream = learner.prepare(transitions, n_states, n_actions)
     state = learner.init(n_states, n_actions) if state is None else state
     while not learner.finished(state):

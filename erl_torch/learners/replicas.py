@@ -67,9 +67,16 @@ class Simulation:
     keep: bool | None = None
 
     def __post_init__(self) -> None:
+        checks.plain(self)
+        checks.instance("mdp", self.mdp, TabularMDP, "a TabularMDP")
+        if self.keep is not None:
+            checks.flag("keep", self.keep)
         checks.at_least("n_episodes", self.n_episodes, 1)
         checks.at_least("episode_length", self.episode_length, 1)
-        for seed in self.seeds:
+        if self.behaviour_policy is not None:
+            behaviour = check_policy("behaviour_policy", self.behaviour_policy, self.mdp.n_states, self.mdp.n_actions)
+            object.__setattr__(self, "behaviour_policy", behaviour)
+        for seed in checks.sequence("seeds", self.seeds):
             checks.at_least("seeds", seed, 0)
 
     @property
@@ -177,6 +184,7 @@ class Replicas:
     backend: str = "auto"
 
     def __post_init__(self) -> None:
+        checks.plain(self)
         object.__setattr__(self, "learners", tuple(self.learners))
         checks.at_least("n_replicas", len(self.learners), 1)
         for learner in self.learners:
@@ -205,7 +213,7 @@ class Replicas:
     ) -> Replicas:
         """``learner`` times ``n_replicas``; ``vectors`` give some of its arguments a value a replica, [R]."""
         names = {f.name for f in fields(learner)}
-        columns = {name: list(values) for name, values in vectors.items()}
+        columns = {name: checks.sequence(name, values) for name, values in vectors.items()}
         for name, column in columns.items():
             if name not in names:
                 raise InputError(name, column, f"left out: the arguments of the learner are {', '.join(sorted(names))}")
@@ -214,7 +222,7 @@ class Replicas:
                 raise InputError(name, f"{len(column)} values", f"one for each of {n_replicas} replicas")
         if n_replicas is None:
             raise InputError("n_replicas", None, "given, or a vector of values")
-        checks.at_least("n_replicas", n_replicas, 1)
+        n_replicas = checks.at_least("n_replicas", n_replicas, 1)
         own = [{name: _number(column[r]) for name, column in columns.items()} for r in range(n_replicas)]
         return cls(tuple(replace(learner, **values) for values in own), threads, block, layout, backend)
 
@@ -283,7 +291,7 @@ class Replicas:
 
 def _number(value: Any) -> Any:
     """A plain number of a NumPy or torch scalar."""
-    return value.item() if hasattr(value, "item") else value
+    return value.item() if np.ndim(value) == 0 and hasattr(value, "item") else value
 
 
 def tuples_of(experience: Experience, r: int, prior: np.ndarray) -> Transitions:

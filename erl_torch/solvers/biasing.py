@@ -198,6 +198,7 @@ def _problems(
     known = Problem.of(mdp, beta, prior_policy)
     if target is None:
         return known, None
+    checks.instance("target", target, TabularMDP, "a TabularMDP")
     if target.reward.shape != mdp.reward.shape:
         raise InputError("target", f"MDP of shape {target.reward.shape}", f"of the shape of mdp, {mdp.reward.shape}")
     problem = Problem.of(target, beta, prior_policy)

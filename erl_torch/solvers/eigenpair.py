@@ -16,7 +16,7 @@ import numpy as np
 import scipy.sparse as sp
 import torch
 
-from erl_torch import kernels
+from erl_torch import checks, kernels
 from erl_torch.chains import EPSILON, Elimination, RegenerativeLU, SingularChainError, classes, likely_state
 from erl_torch.checks import InputError
 from erl_torch.solution import Status
@@ -26,6 +26,7 @@ LOG_POWER_STEPS = 40
 REFUSALS = 5  # chains that fall apart, each followed by more power steps
 STEPS_AFTER_A_REFUSAL = 200
 NEAR = 0.1  # difference of the gains F(h) - h from where Newton is quadratic
+LARGEST_ENTRY = 1e300  # of a matrix: the sum of a row stays in double precision
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,29 +53,26 @@ def perron(matrix: Any, rtol: float = 1e-13, max_steps: int = 60) -> PerronPair:
     """Dominant eigenvalue and right eigenvector of a nonnegative irreducible matrix [n, n].
 
     Args:
-        matrix: scipy sparse or dense, entries >= 0; for the left eigenvector pass its transpose.
-        rtol: spread of the Collatz-Wielandt bounds, relative to the root, to stop at.
-        max_steps: Newton steps.
+        matrix: sparse (scipy, torch) or any array of real numbers, entries in [0, 1e300]; for the left eigenvector pass
+            its transpose.
+        rtol: spread of the Collatz-Wielandt bounds, relative to the root, to stop at; > 0.
+        max_steps: Newton steps, >= 1.
 
     Returns:
         The pair; status REDUCIBLE (message names the classes) if no positive eigenvector exists.
 
     Raises:
-        InputError: not square, or an entry that is negative or not finite.
+        InputError: not square, an entry (or a sum of repeated ones) out of range, or rtol or max_steps out of range.
     """
-    try:
-        if sp.issparse(matrix) and hasattr(matrix, "check_format"):
-            matrix.check_format(full_check=True)
-    except (ValueError, IndexError) as error:
-        raise InputError("matrix", "sparse matrix", f"one with indices in range ({error})") from error
-    m = sp.csr_array(matrix, dtype=np.float64, copy=True)
-    if m.shape[0] != m.shape[1] or m.shape[0] == 0:
-        raise InputError("matrix", f"array of shape {m.shape}", "square")
-    if not (np.isfinite(m.data).all() and (m.data >= 0).all()):
-        raise InputError("matrix", "array", "finite and >= 0 everywhere")
-    m.sum_duplicates()
-    m.eliminate_zeros()
+    rtol, max_steps = checks.positive("rtol", rtol), checks.at_least("max_steps", max_steps, 1)
+    m = checks.sparse("matrix", matrix, ("n", "n"), ", square")
     n = m.shape[0]
+    bad = np.flatnonzero(~((m.data >= 0) & (m.data <= LARGEST_ENTRY)))
+    if bad.size:
+        row = int(np.searchsorted(m.indptr, bad[0], side="right")) - 1
+        raise InputError(
+            f"matrix[{row}, {m.indices[bad[0]]}]", m.data[bad[0]], f"finite and >= 0, at most {LARGEST_ENTRY:g}"
+        )
     label, closed = classes(m)
     if len(closed) > 1 or m.nnz == 0:
         sizes = np.bincount(label)

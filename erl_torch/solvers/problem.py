@@ -35,7 +35,8 @@ class Problem:
     @classmethod
     def of(cls, mdp: TabularMDP, beta: float, prior_policy: Any = None) -> Problem:
         """Restrict ``mdp``. Raises InputError for beta <= 0 or a prior that is 0 somewhere."""
-        checks.temperature("beta", beta)
+        checks.instance("mdp", mdp, TabularMDP, "a TabularMDP")
+        beta = checks.temperature("beta", beta)
         prior = check_prior("prior_policy", prior_policy, mdp.n_states, mdp.n_actions)
         p, n_actions = mdp.transition, mdp.n_actions
         mask = reachable_from(state_graph(p, n_actions), mdp.start)
@@ -43,7 +44,7 @@ class Problem:
         if not mask.all():
             rows = (states[:, None] * n_actions + np.arange(n_actions)).ravel()
             p = sp.csr_array(p[rows][:, states])
-        return cls(states, p, mdp.reward[mask], prior[mask], mdp.start[mask], float(beta))
+        return cls(states, p, mdp.reward[mask], prior[mask], mdp.start[mask], beta)
 
     @property
     def n_states(self) -> int:

@@ -106,6 +106,8 @@ def certify(
     Solves the model, unless ``best`` is its ``solve_soft_bellman`` already: the bounds are those, the gap is the upper
     end on g* less the lower end on J(policy) from the start (``certificates.objective``).
     """
+    for key, one in (("solution", solution), *([] if best is None else [("best", best)])):
+        checks.instance(key, one, Solution, "a Solution")
     problem = Problem.of(mdp, beta, prior_policy)
     bounds = (best or solve_soft_bellman(mdp, beta, prior_policy)).theta_bounds
     assert bounds is not None
