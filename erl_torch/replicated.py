@@ -444,7 +444,7 @@ class Data(NamedTuple):
 def _reservations(
     experience: Experience, learners: list[Any], prior: np.ndarray, model: TabularMDP | None, certify: bool
 ) -> tuple[list[str], list[Data]]:
-    """(notes on what the streams do not allow the learners, what theta is to be held against); each stream is read once.
+    """(notes on what streams do not allow the learners, what theta is to be held against); each stream is read once.
     Theta is not held against the model's."""
     shape = prior.shape
 

@@ -293,7 +293,7 @@ def of_theta(theta: float | None, rewards: tuple[float, float], estimate: Estima
     """
     if theta is None or not np.isfinite(theta):
         return []
-    low, high = -rewards[1], -rewards[0]
+    low, high = 0.0 - rewards[1], 0.0 - rewards[0]  # no -0
     outside = max(low - theta, theta - high)
     if outside > SINGLE * max(abs(low), abs(high)):
         return [

@@ -557,7 +557,7 @@ class EfficientS1:
         start = self.init(n_states, n_actions)
         zero, none = np.zeros(n_states * n_actions), np.zeros(n_states * n_actions, np.int64)
         return OnlineState(
-            **{f.name: getattr(start, f.name) for f in fields(start)},
+            **{f.name: getattr(start, f.name) for f in fields(start) if f.name not in ("status", "message")},
             visits=none,
             fresh=none,
             reward=zero,
