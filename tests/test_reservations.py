@@ -304,7 +304,7 @@ def test_theta_far_from_the_data_is_counted_in_half_widths():
 def test_published_s1_at_a_high_temperature_is_far_off_and_says_so(tmp_path, capsys):
     """Beta 2: its constant steps end tens of half widths from the data; each replica says what its run alone says."""
     full = ("learner.beta=2", "evaluation.pictures=false")
-    alone = notes(tmp_path / "one", "experience.n_episodes=200", learner=full, capsys=capsys)
+    alone = notes(tmp_path / "one", learner=full, capsys=capsys)
     (line,) = [line for line in alone if FAR_OFF in line]
     theta, away, value, half = (
         float(line.split(before)[1].split()[0].strip(",")) for before in ("theta ", " is ", "theta = ", "+- ")
@@ -313,7 +313,7 @@ def test_published_s1_at_a_high_temperature_is_far_off_and_says_so(tmp_path, cap
     assert away > FAR
     result = json.loads((tmp_path / "one" / "result.json").read_text())
     assert result["data_half_widths"] == pytest.approx(away, rel=0.01)
-    many = notes(tmp_path / "many", "experience.n_episodes=200", "n_replicas=2", learner=full)
+    many = notes(tmp_path / "many", "n_replicas=2", learner=full)
     assert any(said.endswith(f"{line} (so replica 0)") or said == f"1 of 2 replicas: {line}" for said in many)
 
 
@@ -356,7 +356,7 @@ BUILT_IN = (
 def test_built_in_environments(tmp_path, env):
     """Their data have no reservation. (Two passes may well end worse than the prior, or at a wrong theta; FrozenLake's
     rewards depend on s', and Acrobot's model is too large for exact figures: notes that are right.)"""
-    small = ["env.n_samples=5"] * (env in ("cart_pole", "mountain_car", "pendulum"))
+    small = ["env.n_samples=2"] * (env in ("cart_pole", "mountain_car", "pendulum"))
     found = notes(tmp_path, f"env={env}", "experience.n_episodes=10", "evaluation.n_episodes=2", *small)
     of_two_passes = (WORSE, OUT_OF_RANGE, FAR_OFF)
     assert [line for line in found if not any(text in line for text in of_two_passes)] == []
