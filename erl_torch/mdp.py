@@ -62,11 +62,9 @@ class TabularMDP:
         if self.start is not None:
             start = checks.array("start", self.start, (n_states,), checks.NOT_NEGATIVE)
         tolerance = np.inf if checks.flag("normalise", normalise) else ROW_SUM_TOLERANCE
-        largest = max(
-            normalise_rows(lambda row: _row_name(row, n_actions), transition.indptr, transition.data, tolerance),
-            normalise_rows(lambda row: "start", np.array([0, n_states]), start, tolerance),
-        )
-        _say_corrected("rows of transition and start", largest)
+        rows = normalise_rows(lambda row: _row_name(row, n_actions), transition.indptr, transition.data, tolerance)
+        _say_corrected("rows of transition", rows)
+        _say_corrected("start", normalise_rows(lambda row: "start", np.array([0, n_states]), start, tolerance))
         object.__setattr__(self, "transition", transition)
         object.__setattr__(self, "reward", reward)
         object.__setattr__(self, "start", start)
@@ -159,7 +157,7 @@ def normalise_rows(
 
 def _say_corrected(what: str, largest: float) -> None:
     if largest > WORTH_A_NOTE:
-        note(f"{what} did not sum to 1, by up to {largest:.1e}: they were divided by their sums")
+        note(f"{what} did not sum to 1, by up to {largest:.1e}: what is kept is divided by the sum")
 
 
 def _csr_of_parts(parts: Sequence[np.ndarray], sizes: tuple[int, ...]) -> sp.csr_array:

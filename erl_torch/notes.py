@@ -7,10 +7,13 @@ them for ``result.json``.
 from __future__ import annotations
 
 import contextlib
+import os
 import sys
 import warnings
 from collections.abc import Iterator
 from typing import Any
+
+PACKAGE = os.path.dirname(__file__) + os.sep
 
 
 class Note(UserWarning):
@@ -18,8 +21,13 @@ class Note(UserWarning):
 
 
 def note(text: str) -> None:
-    """Say ``text`` (one line) to whoever asked for the results."""
-    warnings.warn(" ".join(text.split()), Note, stacklevel=3)
+    """Say ``text`` (one line) to whoever asked for the results: the warning is of the line that called the package."""
+    level, frame = 1, sys._getframe()
+    while frame.f_back is not None and (
+        frame.f_code.co_filename.startswith((PACKAGE, "<string>"))
+    ):  # or its dataclasses
+        level, frame = level + 1, frame.f_back
+    warnings.warn(" ".join(text.split()), Note, stacklevel=level)
 
 
 @contextlib.contextmanager

@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -57,11 +57,14 @@ from erl_torch.training import (
     make_learner,
     make_world,
     note_rows,
+    of_data,
+    plural,
     recorded,
     versions,
     where,
 )
 from erl_torch.transitions import Transitions
+from erl_torch.uncertainty import Estimate
 
 QUANTITIES = {
     "theta": "theta, reward a step",
@@ -121,8 +124,9 @@ def train_replicas(cfg: DictConfig, directory: Path, safe_point: SafePoint, save
         n_experience = max(_lengths(experience))
         judge = _Judges(cfg, env, world, prior, [one.beta for one in learners], seeds, threads)
 
-        for line in _reservations(experience, learners, prior, judge.model):
-            note(line)
+        asked, data = _reservations(experience, learners, prior, judge.model, cfg.evaluation.certify)
+        for said in asked:
+            note(said)
         exact = _exact(cfg, judge, groups)
         record = _Record(groups, exact)
         stream = None if isinstance(experience, Simulation) else [data.checksum() for data in _recorded(experience)]
@@ -206,7 +210,7 @@ def train_replicas(cfg: DictConfig, directory: Path, safe_point: SafePoint, save
                     ended.keep(saved, state.n_tuples, lambda: snapshot() | reached)
             solution = replicas.solution(state, history)
             done = int(history[-1]["n_tuples"].sum())
-            title = f"{cfg.env.name}, {cfg.learner.name}: {cfg.n_replicas} replicas"
+            title = f"{cfg.env.name}, {cfg.learner.name}: {plural(cfg.n_replicas, 'replica')}"
             drawn = [("bands", record.curves(exact), "tuples streamed, each replica", title)]
             if cfg.vary:
                 key, panels = _sweep(groups, record, exact)
@@ -220,8 +224,8 @@ def train_replicas(cfg: DictConfig, directory: Path, safe_point: SafePoint, save
                     board.picture(f"{name}/{k}", card, state.n_tuples)
             board.scalars({"time/tuples_per_second": done / max(learning, 1e-9)}, state.n_tuples)
             board.scalars(_final(groups, record, exact), state.n_tuples)
-            for line in reservations.of_replicas(record.outcomes(solution, judge.model is not None)):
-                note(line)
+            for said in reservations.of_replicas(record.outcomes(solution, data, judge.model is not None)):
+                note(said)
             if solution.failures:
                 board.failed()
 
@@ -248,6 +252,7 @@ def train_replicas(cfg: DictConfig, directory: Path, safe_point: SafePoint, save
             }
             for group, best in zip(groups, exact, strict=True)
         ],
+        "data_half_widths": _half_widths(solution, data),
         "n_experience": n_experience,
         "n_tuples": done,
         "seconds_learning": round(learning, 3),
@@ -429,29 +434,61 @@ class _Judges:
         return found
 
 
+class Data(NamedTuple):
+    """What theta is held against once it is learnt."""
+
+    rewards: tuple[float, float]  # (low, high)
+    estimate: Estimate | None
+
+
 def _reservations(
-    experience: Experience, learners: list[Any], prior: np.ndarray, model: TabularMDP | None
-) -> list[str]:
-    """What the streams do not allow the learners; each stream is read once. Theta is not held against the model's."""
-    if isinstance(experience, Simulation):  # of the model itself: no pass over the tuples tells more
+    experience: Experience, learners: list[Any], prior: np.ndarray, model: TabularMDP | None, certify: bool
+) -> tuple[list[str], list[Data]]:
+    """(notes on what streams do not allow the learners, what theta is to be held against); each stream is read once.
+    Theta is not held against the model's."""
+    shape = prior.shape
+
+    def data_of(here: Counted, learner: Any) -> Data:
+        return Data(here.tally.reward_range, of_data(here.model, learner.beta, prior) if certify else None)
+
+    if isinstance(experience, Simulation):  # of the model itself: it is not held against the model
         behaviour = experience.behaviour_policy
-        own = reservations.of_rewards(float(experience.mdp.reward.min()), float(experience.mdp.reward.max()))
+        rewards = float(experience.mdp.reward.min()), float(experience.mdp.reward.max())
+        own = reservations.of_rewards(*rewards)
         if learners[0].drawn_from_prior == "a" and behaviour is not None:
             table = check_policy("experience.behaviour_policy", behaviour, prior.shape[0], prior.shape[1])
             draws = np.rint(experience.n_tuples * table / len(table))  # as if it were in all states alike
             own += reservations.of_actions(draws, prior, "a")
-        return reservations.of_replicas([own] * len(learners))
+        held = [Data(rewards, None)] * len(learners)
+        if certify and experience.mdp.n_states <= SMALL:
+            same: dict[int, list[int]] = {}
+            for r, seed in enumerate(experience.seeds):
+                same.setdefault(int(seed), []).append(r)
+            for members in same.values():
+                here = reservations.count(experience.stream(members[0], prior), shape[0], shape[1], False)
+                for r in members:
+                    held[r] = data_of(here, learners[r])
+        return reservations.of_replicas([own] * len(learners)), held
     next_actions = any(learner.drawn_from_prior == "a_next" for learner in learners)
     streams_of = [experience] * len(learners) if isinstance(experience, Transitions) else experience
     counted: dict[int, Counted] = {}
     found: list[list[Reservation]] = []
+    held = []
     for learner, data in zip(learners, streams_of, strict=True):
         if id(data) not in counted:
-            counted[id(data)] = reservations.count(data, prior.shape[0], prior.shape[1], next_actions)
+            counted[id(data)] = reservations.count(data, shape[0], shape[1], next_actions)
         here = counted[id(data)]
         against = [] if model is None else reservations.of_model(here, model)
         found.append(reservations.of_stream(here, learner, prior) + against)
-    return reservations.of_replicas(found)
+        held.append(data_of(here, learner))
+    return reservations.of_replicas(found), held
+
+
+def _half_widths(solution: ReplicaSolution, data: list[Data]) -> dict[str, float] | None:
+    """Statistics of how far each theta is from what its own stream says; None where no stream has an interval."""
+    away = [reservations.half_widths(one.theta, d.estimate) for one, d in zip(solution.solutions, data, strict=True)]
+    finite = np.array([x for x in away if np.isfinite(x)])
+    return statistics(finite) | {"replicas": len(finite)} if finite.size else None
 
 
 def _exact(cfg: DictConfig, judges: _Judges, groups: list[Group]) -> list[dict[str, float]]:
@@ -574,12 +611,13 @@ class _Record:
             found["replicas"] = max(found["replicas"], int(inside.size))
         return found
 
-    def outcomes(self, solution: ReplicaSolution, exact: bool) -> list[list[Reservation]]:
-        """How each replica ended; ``exact``: the objectives are."""
+    def outcomes(self, solution: ReplicaSolution, data: list[Data], exact: bool) -> list[list[Reservation]]:
+        """How each replica ended, and what its theta shows; ``exact``: the objectives are."""
         rows = self.rows["objective"] if exact else [np.full(len(solution), np.nan)]
         return [
             reservations.of_outcome(one.status, one.message, float(learnt), float(prior))
-            for one, learnt, prior in zip(solution.solutions, rows[-1], rows[0], strict=True)
+            + reservations.of_theta(one.theta, *against)
+            for one, learnt, prior, against in zip(solution.solutions, rows[-1], rows[0], data, strict=True)
         ]
 
     def curves(self, exact: list[dict[str, float]]) -> dict[str, list[pictures.BandLine]]:
@@ -665,10 +703,16 @@ def _summary(cfg: DictConfig, groups: list[Group], result: Mapping[str, Any], di
     first = f"{cfg.env.name}, {cfg.learner.name}"
     last_seed = cfg.seed + cfg.n_replicas - 1
     seeds = f"seed {cfg.seed}" if cfg.n_replicas == 1 else f"seeds {cfg.seed} to {last_seed}"
+    solved = cfg.n_replicas * len(groups)
     lines = [
         "",
         *(_one_group(first, seeds, result) if len(groups) == 1 else _many_groups(first, seeds, groups, result)),
     ]
+    if (away := result["data_half_widths"]) is not None:
+        lines.append(
+            f"{'the data say':18}theta is off by {away['median']:.3g} half widths of the 95% interval of its own "
+            f"stream (median; at most {away['max']:.3g}; {away['replicas']} of {solved} streams have one)"
+        )
     rate = result["n_tuples"] / max(result["seconds_learning"], 1e-3) / 1e6
     shown, logs = where(directory)
     lines += [
@@ -683,7 +727,7 @@ def _summary(cfg: DictConfig, groups: list[Group], result: Mapping[str, Any], di
 
 def _one_group(first: str, seeds: str, result: Mapping[str, Any]) -> Iterator[str]:
     (group,) = result["groups"]
-    yield f"{first}, beta {group['beta']:g}, {result['n_replicas']} replicas ({seeds}): {ended_as(result)}"
+    yield f"{first}, beta {group['beta']:g}, {plural(result['n_replicas'], 'replica')} ({seeds}): {ended_as(result)}"
     yield f"{'':18}{'mean':>12}{'quartiles':>26}{'extremes':>26}{'exact':>12}"
     for name in QUANTITIES:
         found = group.get(name)

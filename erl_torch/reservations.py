@@ -30,6 +30,7 @@ LEVEL = 1e-9  # chance, at most, that data as they should be are spoken of
 EXPECTED = 1.0  # draws, below which cells are pooled
 MATTERS = 1e-4  # beta^2 Var/2: share of exp(beta r) that noise in rewards adds
 SINGLE = 1e-6  # relative: rewards recorded in single precision are the same
+FAR = 10.0  # half widths of the 95% interval, from which a learnt theta is far from the data's
 
 
 class Reservation(NamedTuple):
@@ -279,6 +280,52 @@ def of_outcome(status: Status, message: str, learnt: float, prior: float) -> lis
     return found
 
 
+def of_theta(theta: float | None, rewards: tuple[float, float], estimate: Estimate | None = None) -> list[Reservation]:
+    """What theta itself shows.
+
+    Rewards in [low, high] have theta* in [-high, -low], whatever the dynamics: no policy earns more than high a step,
+    KL costs no less than nothing, and the prior's earns low at least, without KL.
+
+    Args:
+        theta: learnt; None or NaN, where there is none, says nothing.
+        rewards: (low, high) of the stream.
+        estimate: theta as the data have it; says nothing where its interval is withheld.
+    """
+    if theta is None or not np.isfinite(theta):
+        return []
+    low, high = 0.0 - rewards[1], 0.0 - rewards[0]  # no -0
+    outside = max(low - theta, theta - high)
+    if outside > SINGLE * max(abs(low), abs(high)):
+        return [
+            Reservation(
+                "theta out of range",
+                f"the learnt theta {theta:.6g} is wrong: with rewards from {rewards[0]:.6g} to {rewards[1]:.6g}, as in "
+                f"the stream, theta* lies in [{low:.6g}, {high:.6g}], whatever the dynamics",
+            )
+        ]
+    away = half_widths(theta, estimate)
+    if estimate is None or not away > FAR:
+        return []
+    low, high = estimate.interval(1 - LEVEL)
+    if low <= theta <= high:
+        return []
+    return [
+        Reservation(
+            "theta far from the data's",
+            f"the learnt theta {theta:.6g} is {away:.3g} half widths from what the data say, {estimate} (95%): more "
+            "passes, other steps or learner=certainty_equivalence come closer",
+        )
+    ]
+
+
+def half_widths(theta: float | None, estimate: Estimate | None) -> float:
+    """Distance of theta from the middle of the data's 95% interval, in half widths; NaN where there is none."""
+    if theta is None or estimate is None or estimate.withheld:
+        return np.nan
+    low, high = estimate.interval()
+    return abs(theta - 0.5 * (low + high)) / (0.5 * (high - low)) if high > low else np.nan
+
+
 def of_replicas(found: Sequence[Sequence[Reservation]]) -> list[str]:
     """A line a kind, with how many of the replicas have it and the text of the first that has."""
     texts: dict[str, list[tuple[int, str]]] = {}
@@ -288,5 +335,5 @@ def of_replicas(found: Sequence[Sequence[Reservation]]) -> list[str]:
     lines = []
     for (r, text), *others in texts.values():
         which = f" (so replica {r})" if any(other != text for _, other in others) else ""
-        lines.append(f"{len(others) + 1} of {len(found)} replicas: {text}{which}")
+        lines.append(f"{len(others) + 1} of {len(found)} replica{'s' * (len(found) > 1)}: {text}{which}")
     return lines

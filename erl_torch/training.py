@@ -29,6 +29,7 @@ from erl_torch.chains import SingularChainError
 from erl_torch.checkpoint import Checkpoints, rows_of
 from erl_torch.checks import InputError
 from erl_torch.config import check_keys
+from erl_torch.empirical import EmpiricalMDP
 from erl_torch.envs.discretise import Discretise
 from erl_torch.envs.estimate import estimate_mdp
 from erl_torch.envs.grid_world import GridWorld
@@ -51,7 +52,7 @@ from erl_torch.uncertainty import Estimate, theta_uncertainty
 SafePoint = Callable[[], None]
 TABLES = 8  # of a learner's size, about, while it learns and is evaluated
 REPLICA_BYTES = 10_000  # of a replica, besides: generators and settings
-SMALL = 2000  # states of an empirical model that is solved beside every run
+SMALL = 2000  # states of a model, or that a stream meets, up to which it is solved beside every run
 NOT_ARGUMENTS = ("name", "id", "suggest", "stream", "n_samples", "model_seed")
 
 
@@ -204,7 +205,8 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
                 for step in (0, run.step(state)):
                     board.scalars(_optimal_tags(solution, judge, episode, horizon), step)
             exact = (last.objective, first.objective) if judge is not None else (np.nan, np.nan)
-            for _, text in reservations.of_outcome(solution.status, solution.message, *exact):
+            ended_so = reservations.of_outcome(solution.status, solution.message, *exact)
+            for _, text in ended_so + run.outcome(solution.theta, estimate):
                 note(text)
             rate = run.step(state) / max(clock.seconds, 1e-9)
             board.scalars({f"time/{run.unit}_per_second": rate}, run.step(state))
@@ -219,12 +221,17 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
     solution.save(directory / "solution.npz")
     seconds = time.perf_counter() - began
     result = _result(cfg, solution, last, run.n_experience, clock.seconds, seconds)
-    result["data"] = None if estimate is None else str(estimate)
+    if estimate is not None:
+        result["data"] = f"nothing: {estimate.withheld}" if np.isnan(estimate.value) else str(estimate)
+    else:
+        result["data"] = None
     result["data_smallest_visits"] = None if estimate is None or estimate.withheld else estimate.smallest_visits
+    away = reservations.half_widths(solution.theta, estimate)
+    result["data_half_widths"] = away if np.isfinite(away) else None
     result["n_skipped"] = run.n_skipped
     result["notes"] = notes
     write_json(directory / "result.json", result)
-    print(_summary(cfg, first, last, start, result, directory, run.unit))
+    print(_summary(cfg, first, last, start, result, directory, run.unit, played=judge is None))
     if stopped is not None:
         raise stopped
     saved.clear()
@@ -351,6 +358,10 @@ class _Learning:
         found = reservations.of_stream(self.counted, self.learner, prior)
         return found + ([] if judge is None else reservations.of_model(self.counted, judge, estimate, bounds))
 
+    def outcome(self, theta: float | None, estimate: Estimate | None) -> list[Reservation]:
+        """What the learnt theta shows."""
+        return reservations.of_theta(theta, self.counted.tally.reward_range, estimate)
+
     def optimum(self, judge: TabularMDP | None, prior: np.ndarray) -> Solution | None:
         """The exact answer to ``judge``, to compare with."""
         if judge is None:
@@ -363,15 +374,25 @@ class _Learning:
             allowed = f"false: the exact solution of this model needs more memory than there is ({error})"
             raise InputError("evaluation.certify", "true", allowed) from error
 
-    def uncertainty(self, prior: np.ndarray) -> Estimate | None:
-        """theta* with its error, as the counts of the stream alone have it; None where that is no small problem."""
-        model = self.counted.model
-        if self.sizes[0] > SMALL or model is None:
-            return None
-        # Streams that return nowhere, and chains that fall apart in double precision, have no such figure.
-        with contextlib.suppress(InputError, SingularChainError, np.linalg.LinAlgError):
-            return theta_uncertainty(model, self.learner.beta, prior)
-        return None
+    def uncertainty(self, prior: np.ndarray) -> Estimate:
+        """theta* with its error, as the counts of the stream alone have it."""
+        return of_data(self.counted.model, self.learner.beta, prior)
+
+
+def of_data(model: EmpiricalMDP | None, beta: float, prior: np.ndarray) -> Estimate:
+    """theta* with its error, as a stream alone has it; withheld, with a value of NaN, where that cannot be had."""
+    if model is None:
+        reason = "the squares of the rewards overflow"
+    elif (met := int(model.visits.any(1).sum())) > SMALL:
+        reason = f"the stream meets {met:,} states, and more than {SMALL:,} are not solved beside a run"
+    else:
+        try:
+            return theta_uncertainty(model, beta, prior)
+        except InputError as error:  # streams that return nowhere
+            reason = str(error)
+        except (SingularChainError, np.linalg.LinAlgError):
+            reason = "the chain of the data falls apart in double precision"
+    return Estimate("theta", np.nan, np.inf, withheld=reason)
 
 
 class _Solving:
@@ -431,6 +452,10 @@ class _Solving:
     def solution(self, state: ExactState, history: list[dict[str, float]], stopped: BaseException | None) -> Solution:
         return self.learner.solution(self.mdp, state, history, stopped is not None)
 
+    def outcome(self, *_: object) -> list[Reservation]:
+        """There are no data."""
+        return []
+
     def optimum(self, judge: TabularMDP | None, prior: np.ndarray) -> None:
         """The run itself finds it."""
 
@@ -475,7 +500,7 @@ def _optimal_tags(
 
 
 def _data_tags(estimate: Estimate | None) -> dict[str, float]:
-    if estimate is None:
+    if estimate is None or np.isnan(estimate.value):
         return {}
     if estimate.withheld:
         return {"data/theta": estimate.value}
@@ -786,12 +811,18 @@ def _summary(
     result: dict[str, Any],
     directory: Path,
     unit: str,
+    played: bool,
 ) -> str:
     directory, logs = where(directory)
     done = result[f"n_{unit}"]
     is_s1 = isinstance(start, S1State)
+    of_play = "  (the prior's: an estimate, of the episodes played)" * played
     rows = [
-        *([("theta", f"{-first.objective:12.5f}", f"{result['theta']:12.5f}")] if result["theta"] is not None else []),
+        *(
+            [("theta", f"{-first.objective:12.5f}", f"{result['theta']:12.5f}{of_play}")]
+            if result["theta"] is not None
+            else []
+        ),
         *([("rho", f"{'-':>12}", f"{result['rho']:12.4e}")] if is_s1 and result["rho"] is not None else []),
         ("reward per step", f"{first.reward_per_step:12.5f}", f"{last.reward_per_step:12.5f}"),
         ("objective", f"{first.objective:12.5f}", f"{last.objective:12.5f}"),
@@ -806,8 +837,9 @@ def _summary(
     if result["theta_bounds"] is not None:
         lines.append(f"{'proven':18}{proven(result['theta_bounds'], result['gap'])}")
     if result["data"]:
-        fewest = result["data_smallest_visits"]
+        fewest, away = result["data_smallest_visits"], result["data_half_widths"]
         rests = "" if fewest is None else f" (95%; {fewest} visits or more of each pair that counts)"
+        rests += f"; learnt: {away:.3g} half widths off" if away is not None and away > 1 else ""
         lines.append(f"{'the data say':18}{result['data']}{rests}")
     if result["n_experience"]:
         rate = done / max(result["seconds_learning"], 1e-3) / 1e6
@@ -827,7 +859,11 @@ def _summary(
 def ended_as(result: Mapping[str, Any]) -> str:
     """The status of ``result.json``, which is no success without its notes."""
     n = len(result["notes"])
-    return f"{result['status']}, with {n} note{'s' * (n > 1)}" if n else f"{result['status']}"
+    return f"{result['status']}, with {plural(n, 'note')}" if n else f"{result['status']}"
+
+
+def plural(n: int, thing: str) -> str:
+    return f"{n} {thing}" if n == 1 else f"{n} {thing}s"
 
 
 def note_rows(result: Mapping[str, Any]) -> list[str]:

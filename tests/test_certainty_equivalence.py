@@ -21,7 +21,6 @@ from erl_torch import (
 )
 from erl_torch.envs.windy_cliff import WindyCliffEnv
 from erl_torch.evaluation import objective
-from erl_torch.solvers.soft_bellman import solve_problem
 
 CLIFF = WindyCliffEnv().mdp
 
@@ -152,14 +151,47 @@ def test_loss_falls_as_one_over_tuples():
     assert 0 <= gaps[1] < gaps[0] / 4
 
 
-def test_a_stream_that_leaves_states_for_ever_has_an_estimate():
-    """0 is better off never to leave, and is left at last: no one theta is proven, and the learner has an estimate."""
-    s = [0] * 50 + [1] * 50
+def test_a_stream_that_leaves_states_for_ever_has_the_theta_of_where_it_ends():
+    """0 is better off never to leave, and is left at last: 1 pays 0, for log 2 of KL a step."""
+    found = CertaintyEquivalence(5.0).fit(tuples((0, 0, 5.0, 0), (0, 1, 0.0, 1), (1, 0, 0.0, 1)), 2, 2)
+    assert found.status is Status.REDUCIBLE
+    assert found.theta == pytest.approx(np.log(2) / 5, abs=1e-12)
+    assert "theta is that of the closed set" in found.message
+    assert torch.isfinite(found.policy).all()
+    s = [0] * 50 + [1] * 50  # an only action, which leaves 0 once in 50 steps: nothing is better than where it ends
     data = Transitions(s, [0] * 50 + [1] * 50, [1.0] * 49 + [0.0] * 51, [*s[1:], 1], [0] * 100)
     found = CertaintyEquivalence(5.0).fit(data, 2, 2)
-    assert np.isfinite(found.theta)
-    assert torch.isfinite(found.policy).all()
-    bounds_middle = solve_problem(
-        empirical_mdp(data, 2, 2).problem(5.0).problem, empirical_mdp(data, 2, 2)
-    ).theta_bounds
-    assert found.theta == pytest.approx(0.5 * sum(bounds_middle))
+    assert found.status is Status.CONVERGED
+    assert found.theta == pytest.approx(np.log(2) / 5, abs=1e-9)
+
+
+def test_short_random_streams_have_the_theta_of_one_class_or_say_why_not():
+    """Against value iteration on the class that the counts end in."""
+    rng, seen = np.random.default_rng(3), set()
+    for _ in range(60):
+        n_states, n = rng.integers(2, 5), rng.integers(3, 12)
+        s = rng.integers(n_states, size=n + 1)
+        data = tuples(*zip(s[:-1], rng.integers(2, size=n), rng.choice([0.0, 1.0, -2.0, 5.0], n), s[1:], strict=True))
+        try:
+            found = CertaintyEquivalence(2.0).fit(data, n_states, 2)
+        except InputError:
+            continue
+        seen.add(found.status)
+        model = empirical_mdp(data, n_states, 2)
+        part = model.problem(2.0)
+        p = part.problem.transition.toarray().reshape(part.problem.n_states, 2, -1)
+        reach = np.linalg.matrix_power(p.any(1) + np.eye(len(p)), len(p)) > 0
+        ends = [i for i in range(len(p)) if (reach[:, i] | ~reach[i]).all()]  # all that i leads to lead back
+        ends = [i for i in ends if reach[np.flatnonzero(reach[i])][:, i].all()]
+        best, _ = oracle.soft_optimum(
+            p[np.ix_(ends, [0, 1], ends)], part.problem.reward[ends], part.problem.prior[ends].clip(1e-300), 2.0
+        )
+        assert found.theta == pytest.approx(-best, abs=1e-7)
+        if found.status is Status.CONVERGED:  # no state is better off
+            best, _ = oracle.soft_optimum(p, part.problem.reward, part.problem.prior.clip(1e-300), 2.0)
+            assert found.theta == pytest.approx(-best, abs=1e-7)
+            assert not part.reducible
+        else:
+            assert found.message
+            assert part.reducible or len(ends) < len(p)
+    assert {Status.CONVERGED, Status.REDUCIBLE} <= seen

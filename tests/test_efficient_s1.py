@@ -384,7 +384,7 @@ def test_step_by_step_is_iterate_and_leaves_the_state_alone():
         state = after
         assert torch.equal(state.policy, expected.policy)
     assert (state.bias_iteration, state.epoch, state.n_tuples) == (2, 2, 6 * len(STREAM))
-    assert learner.solution(state).status is Status.COMPLETED
+    assert learner.solution(state).status is Status.UNCERTIFIED  # after so few
     assert set(learner.fit(STREAM, 15, 4).history) == set(state.metrics())
 
 
@@ -641,3 +641,47 @@ def test_a_penalty_that_is_never_paid_certifies_nothing_else():
     *_, online = EfficientS1(1.0).online([data], 2, 2)
     if online.certified:
         assert online.theta == pytest.approx(-best, abs=0.2)
+
+
+def test_passes_that_end_before_the_certificate_is_narrow_are_uncertified():
+    """Of a binned task, pairs seen once or twice; every reward is 1, so theta of the data is -1 + the KL of what is not
+    there, at most log(2)/beta."""
+    rng = np.random.default_rng(0)
+    s = np.cumsum(rng.choice([1, 1, 2], 300)) % 150
+    columns = s[:-1], rng.integers(2, size=299), np.ones(299), s[1:], rng.integers(2, size=299)
+    data = Transitions(*columns)
+    learner, best = EfficientS1(1.0, n_bias=2), CertaintyEquivalence(1.0).fit(data, 150, 2).theta
+    found = learner.fit(data, 150, 2)
+    assert found.status is Status.UNCERTIFIED
+    low, high = (float(x) for x in found.message.split("theta* in [")[1].rstrip("]").split(", "))
+    assert low <= best <= high
+    assert low <= found.theta <= high
+    assert -1 <= found.theta <= -1 + np.log(2)
+    # Optimism about noise is another problem, which nothing is certified of.
+    noisy = replace(data, r=data.r + rng.standard_normal(299))
+    assert EfficientS1(1.0, n_bias=1, mean_reward=False).fit(noisy, 150, 2).status is Status.COMPLETED
+
+
+def test_the_certificate_holds_with_its_rounding():
+    """V of size 1e9: what rounding leaves of J and g* is within the ends, and the ends are not exact."""
+    stream = EfficientS1().prepare(STREAM, 15, 4)
+    policy, shift = CertaintyEquivalence().fit(STREAM, 15, 4).policy.numpy(), 1e9
+    log_psi = -10.0 * (shift + np.linspace(0.0, 1.0, 15))
+    low, high = certificate(stream.part, log_psi, policy)
+    exact = certificate(stream.part, -10.0 * np.linspace(0.0, 1.0, 15), policy)
+    assert low < exact[0] + 1e-6
+    assert high > exact[1] - 1e-6
+    empirical, reward, _ = oracle.counted(STREAM, 15, 4)
+    best, _ = oracle.soft_optimum(empirical, reward, np.full((15, 4), 0.25), 10.0)
+    assert low <= best <= high
+
+
+def test_a_fault_of_the_counts_is_not_taken_for_a_short_stream(monkeypatch):
+    *_, state = EfficientS1().online([STREAM], 15, 4)
+
+    def refuse(*_):
+        raise InputError("beta", 1, "another")
+
+    monkeypatch.setattr("erl_torch.empirical.EmpiricalMDP.problem", refuse)
+    with pytest.raises(InputError, match="beta"):
+        state.part()

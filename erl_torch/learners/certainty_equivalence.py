@@ -21,7 +21,7 @@ from erl_torch import checks
 from erl_torch.empirical import EmpiricalMDP, EmpiricalProblem, empirical_mdp
 from erl_torch.learners.fitting import columns, epochs
 from erl_torch.mdp import check_policy
-from erl_torch.solution import Solution, Status
+from erl_torch.solution import Solution, Status, proven
 from erl_torch.solvers.soft_bellman import solve_problem
 from erl_torch.transitions import Recording
 
@@ -37,7 +37,7 @@ class CertaintyEquivalenceState:
     policy: torch.Tensor  # [S, A]; 0 on pairs never visited, the prior in states outside the empirical problem
     u: torch.Tensor  # [S, A], largest 1; 0 on pairs never visited
     rho: float
-    theta: float  # middle of the bounds on the empirical theta*
+    theta: float  # middle of the bounds on the empirical theta*; of the closed set where the model is reducible
     reward_bias: torch.Tensor  # [S, A]
     empirical_width: float  # of those bounds, reward a step
     answer: Solution | None = None
@@ -98,7 +98,8 @@ class CertaintyEquivalence:
         checks.at_least("max_steps", self.max_steps, 1)
 
     def fit(self, transitions: Recording, n_states: int, n_actions: int) -> Solution:
-        """Count and solve. Status REDUCIBLE, with a message, where the stream shows several closed sets of states."""
+        """Count and solve. Status REDUCIBLE, with a message, where the states that the stream shows are not one
+        recurrent class; theta is then that of the closed set of states (of several, the most visited)."""
         (state,) = self.iterate(transitions, n_states, n_actions)
         return self.solution(state, [state.metrics()])
 
@@ -129,8 +130,16 @@ class CertaintyEquivalence:
         answer = solve_problem(part.problem, stream.model, self.prior_policy, self.tol, self.max_steps)
         assert answer.theta_bounds is not None
         lower, upper = answer.theta_bounds
-        # An estimate, also where a set of states is left for ever and nothing is proven of one theta.
-        theta = 0.5 * (lower + upper) if answer.theta is None else answer.theta
+        theta, message, status = answer.theta, part.message, Status.REDUCIBLE if part.reducible else answer.status
+        if theta is None:  # states are left for ever in the data, where other states may be better
+            ending = solve_problem(part.problem.ending(), stream.model, None, self.tol, self.max_steps)
+            theta = ending.theta
+            assert theta is not None
+            message = "; ".join(filter(None, (part.message, answer.message, "theta is that of the closed set")))
+        elif answer.status is not Status.CONVERGED:
+            message = "; ".join(
+                filter(None, (part.message, answer.message, f"in the data, {proven((lower, upper), None)}"))
+            )
         with np.errstate(over="ignore", under="ignore"):
             rho = float(np.exp(-self.beta * (theta + answer.reward_bias_max))) if answer.rho is None else answer.rho
         known = torch.from_numpy(part.used | ~part.used.any(1, keepdims=True))
@@ -142,8 +151,8 @@ class CertaintyEquivalence:
             theta_bounds=None,  # what is proven of the empirical model is not proven of the true one
             gap=None,
             n_steps=stream.n_tuples,
-            status=Status.REDUCIBLE if part.reducible else answer.status,
-            message=part.message or answer.message,
+            status=status,
+            message=message,
         )
         return replace(
             state,

@@ -81,14 +81,13 @@ import torch
 from scipy.special import logsumexp, softmax
 
 from erl_torch import checks, kernels
-from erl_torch.certificates import soft_backup
+from erl_torch.certificates import gains, policy_gains, soft_backup
 from erl_torch.checks import InputError
 from erl_torch.empirical import EmpiricalMDP, EmpiricalProblem, empirical_mdp, tally
-from erl_torch.evaluation import kl_per_state
 from erl_torch.learners.algorithm_s1 import BLOCK, LOG_PSI_EPSILON
 from erl_torch.learners.fitting import NonFiniteError, columns, epochs, run_to_end
 from erl_torch.mdp import check_prior
-from erl_torch.solution import Solution, Status
+from erl_torch.solution import Solution, Status, proven
 from erl_torch.solvers.problem import Problem
 from erl_torch.transitions import Parts, Recording, Selection, Transitions
 
@@ -96,6 +95,7 @@ LAST_STEP = 100_000  # visits of a pair in one biasing iteration after which its
 SAFE_RANGE = 180.0  # of logarithms, for plain numbers: products of four such stay in range
 DAMPING = 0.9  # step of value iteration on the counts
 SWEPT_PER_TUPLE = 8  # entries of the counts that it may read at a phase's end, for each tuple so far
+WIDE = 0.003  # width of a certificate, relative to what its policy meets, beyond which a run is no success
 STATE_SWEEPS = 32  # its sweeps at most for the policy of a state that is yielded
 
 
@@ -120,6 +120,8 @@ class EfficientState:
     empirical_width: float = math.inf  # bound on the policy's loss in the empirical model, reward a step
     psi_converged: bool = True
     certified: bool = False
+    status: Status | None = None  # how a run ends that ends here; None: by the passes that are made
+    message: str = ""  # what is left out, and how wide the certificate is if too wide
 
     @property
     def rho(self) -> float:
@@ -141,6 +143,13 @@ class EfficientState:
     def theta(self) -> float:
         """-log(rho)/beta - Delta, reward a step."""
         return -self.log_rho / self.beta - self.reward_bias_max
+
+    def with_theta_in(self, bounds: tuple[float, float]) -> EfficientState:
+        """With rho such that theta is within bounds that are known to hold; unchanged where it is."""
+        if bounds[0] <= self.theta <= bounds[1]:
+            return self
+        theta = min(max(self.theta, bounds[0]), bounds[1])
+        return replace(self, log_rho=-self.beta * (theta + self.reward_bias_max))
 
     @property
     def u(self) -> torch.Tensor:
@@ -193,8 +202,8 @@ class OnlineState(EfficientState):
     log_rho_max: float
     phase_end: int  # tuples
     n_replaced: int = 0  # phases at whose end V was taken from the counts
-    status: Status = Status.UNCERTIFIED  # CONVERGED where certified, REDUCIBLE as in CertaintyEquivalence
-    message: str = "no state has been returned to yet"  # what is left out, and how wide the certificate is if too wide
+    status: Status | None = Status.UNCERTIFIED  # CONVERGED where certified, REDUCIBLE as in CertaintyEquivalence
+    message: str = "no state has been returned to yet"
 
     @property
     def value(self) -> np.ndarray:
@@ -220,7 +229,9 @@ class OnlineState(EfficientState):
         """The problem of the counts; None while no state has been returned to."""
         try:
             return self.model.problem(self.beta, self.prior_policy)
-        except InputError:
+        except InputError as error:
+            if error.key != "transitions":
+                raise
             return None
 
     def backed_up(self, part: EmpiricalProblem, value: np.ndarray) -> np.ndarray:
@@ -261,6 +272,7 @@ class EfficientStream:
     psi_rows: tuple[np.ndarray, np.ndarray, np.ndarray]  # CSR, rows of the visited pairs that sum to 1
     log_keep: np.ndarray  # [n_visited], log of what an epoch of lines 2-3 leaves of the old value; -inf: nothing
     log_rho_max: float
+    theta_bounds: tuple[float, float]  # of V = 0, where the problem is the one that z solves; else infinite
 
 
 @dataclass(frozen=True, eq=False)
@@ -350,8 +362,10 @@ class EfficientS1:
     def fit(self, transitions: Recording, n_states: int, n_actions: int) -> Solution:
         """Run to the end and return the solution.
 
-        Status CONVERGED once certified, COMPLETED after n_bias iterations; NON_FINITE only with
-        ``log_domain="off"``, with the tables of the last good epoch.
+        Status CONVERGED once certified, COMPLETED after n_bias iterations, UNCERTIFIED where the certificate is then
+        wider than .3% of what the policy meets, REDUCIBLE as in CertaintyEquivalence (these two with ``certificate``,
+        ``unvisited="exclude"`` and mean rewards only); NON_FINITE only with ``log_domain="off"``, with the tables of
+        the last good epoch.
 
         Raises:
             InputError: a state or action out of range, a prior policy of the wrong shape, or a stream that never
@@ -378,7 +392,7 @@ class EfficientS1:
         """The solution that ``state`` stands for; ``history`` holds one ``metrics()`` an epoch."""
         if failure is not None:
             status = Status.NON_FINITE
-        elif isinstance(state, OnlineState):
+        elif state.status is not None and (isinstance(state, OnlineState) or self.finished(state)):
             status = state.status
         elif state.certified:
             status = Status.CONVERGED
@@ -396,7 +410,7 @@ class EfficientS1:
             reward_bias_max=state.reward_bias_max,
             n_steps=state.n_tuples,
             status=status,
-            message=str(failure) if failure else state.message if isinstance(state, OnlineState) else "",
+            message=str(failure) if failure else state.message,
             beta=self.beta,
             history=columns(history or []),
         )
@@ -480,6 +494,7 @@ class EfficientS1:
             with np.errstate(divide="ignore"):
                 log_keep = visits[visited] * np.log1p(-self.lr_psi)
         noisy = not self.mean_reward and found.varied
+        solved = self.unvisited == "exclude" and not noisy
 
         def columns(chunk: Transitions) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             after = chunk.s_next if self.expected_backup else chunk.s_next * np.int32(n_actions) + chunk.a_next
@@ -498,6 +513,9 @@ class EfficientS1:
             psi_rows=(np.append(indptr[visited], len(values)), indices, values),
             log_keep=log_keep,
             log_rho_max=max(0.0, self.beta * found.reward_range[1]),
+            theta_bounds=part.problem.gains(np.zeros(part.problem.n_states)).theta_bounds
+            if solved
+            else (-np.inf, np.inf),
         )
 
     def step(self, state: EfficientState, stream: EfficientStream) -> EfficientState:
@@ -509,6 +527,7 @@ class EfficientS1:
             state = replace(state, bias_iteration=state.bias_iteration + 1, epoch=0)
         if state.epoch == 0:
             state = self._new_biases(replace(state, weight=stream.weight), stream)
+            state = state.with_theta_in(stream.theta_bounds)
         log_z, log_total, log_rho = self._u_epoch(state, stream)
         log_average = log_z
         inside, log_psi = stream.inside, state.log_psi_in_use.numpy()[:, None]
@@ -532,17 +551,14 @@ class EfficientS1:
             log_average=torch.from_numpy(log_average),
             log_psi=torch.from_numpy(-logsumexp(log_weight + log_u, axis=1)),  # line 12
         )
-        low, high = certificate(stream.part, after.log_psi.numpy(), after.policy.numpy())
-        width = high - low
-        certified = self.certificate and is_narrow(stream.part, (-high, -low), self.tol, after.policy.numpy())
-        return replace(after, empirical_width=width, certified=certified)
+        return self._certified(after, stream.part, solved=np.isfinite(stream.theta_bounds[0]))
 
     def init_online(self, n_states: int, n_actions: int) -> OnlineState:
         """The state of the online mode before any tuple."""
         start = self.init(n_states, n_actions)
         zero, none = np.zeros(n_states * n_actions), np.zeros(n_states * n_actions, np.int64)
         return OnlineState(
-            **{f.name: getattr(start, f.name) for f in fields(start)},
+            **{f.name: getattr(start, f.name) for f in fields(start) if f.name not in ("status", "message")},
             visits=none,
             fresh=none,
             reward=zero,
@@ -619,6 +635,25 @@ class EfficientS1:
             return np.array([self.lr_u])
         n = np.arange(math.ceil(min(self.clock_horizon * (1 / self.clock_floor - 1), LAST_STEP)) + 1)
         return np.asarray(np.maximum(self.clock_floor, self.clock_horizon / (self.clock_horizon + n)))
+
+    def _certified(self, state: EfficientState, part: EmpiricalProblem, solved: bool) -> EfficientState:
+        """With the certificate, and what it says where the run ends; ``solved``: it is of the problem that z solves."""
+        policy = state.policy.numpy()
+        low, high = certificate(part, state.log_psi.numpy(), policy)
+        certified = self.certificate and is_narrow(part, (-high, -low), self.tol, policy)
+        state = replace(state, empirical_width=high - low, certified=certified)
+        if not (self.certificate and solved):
+            return state
+        status = Status.REDUCIBLE if part.reducible else None
+        message = [part.message] if part.reducible else []
+        if not self.finished(state):
+            return replace(state, status=status, message="; ".join(message))
+        if not is_narrow(part, (-high, -low), max(WIDE, self.tol), policy):
+            status = status or Status.UNCERTIFIED
+            message.append(
+                f"certificate {high - low:.2g} wide after all passes; in the data, {proven((-high, -low), None)}"
+            )
+        return replace(state, status=status, message="; ".join(message)).with_theta_in((-high, -low))
 
     def _u_epoch(self, state: EfficientState, stream: EfficientStream) -> tuple[np.ndarray, np.ndarray, float]:
         """(log z, log total, log rho) after an epoch of lines 9-11."""
@@ -844,16 +879,14 @@ SWITCHES = (
 def certificate(part: EmpiricalProblem, log_psi: np.ndarray, policy: np.ndarray) -> tuple[float, float]:
     """(min(T_pi V - V), max(TV - V)) on the empirical problem, V = -log(psi)/beta: J(pi) and g* there lie between.
 
-    What ``policy`` [S, A] does in pairs that take no part is left out, and the rest normalised.
+    Bounds with their rounding (``erl_torch.certificates``), for the problem as its numbers stand. What ``policy``
+    [S, A] does in pairs that take no part is left out, and the rest normalised.
     """
     problem = part.problem
     value = -log_psi[problem.states] / problem.beta
-    inside = within(part, policy)
-    q = problem.action_value(value)
-    backed_up, _ = soft_backup(q, problem.prior, problem.beta)
-    prior = np.where(inside > 0, problem.prior, 1.0)
-    followed = (inside * q).sum(1) - kl_per_state(inside, prior) / problem.beta
-    return float((followed - value).min()), float((backed_up - value).max())
+    parts = (problem.transition, problem.reward, problem.prior, problem.beta)
+    low, _ = policy_gains(*parts, within(part, policy), value)
+    return float(low.min()), float(gains(*parts, value).high.max())
 
 
 def is_narrow(part: EmpiricalProblem, bounds: tuple[float, float], tol: float, policy: np.ndarray) -> bool:

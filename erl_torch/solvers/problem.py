@@ -130,6 +130,15 @@ class Problem:
         kernels.tilt_rows(p.indptr, p.indices, p.data, h, log_mean, kl, tilted)
         return log_mean, kl, tilted
 
+    def ending(self) -> Problem:
+        """On the one closed class, which the process ends in under policies with full support."""
+        label, closed = self.classes
+        inside = np.flatnonzero(label == np.flatnonzero(closed)[0])
+        rows = (inside[:, None] * self.n_actions + np.arange(self.n_actions)).ravel()
+        p = sp.csr_array(self.transition[rows][:, inside])
+        start = np.full(len(inside), 1.0 / len(inside))
+        return Problem(self.states[inside], p, self.reward[inside], self.prior[inside], start, self.beta)
+
     def regeneration_state(self) -> int | None:
         """A likely start in the only closed class, or None if there are several."""
         label, closed = self.classes
