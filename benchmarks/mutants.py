@@ -1,6 +1,6 @@
 """Mistakes that somebody could have made, one at a time, each with the tests that must notice it.
 
-    python benchmarks/mutants.py [--processes 1|2] [part of a name ...]      about half an hour of one core
+    python benchmarks/mutants.py [processes=1] [to=FILE.json] [part of a name ...]     about half an hour of one core
 
 A mutant is a patch (a text that stands once in a file, and another for it) and the tests that must fail on it. All
 those tests pass first, without any patch. Then the tree is copied, a patch applied, its tests are run, and the file is
@@ -11,30 +11,40 @@ put back, mutant by mutant. What is found of a mutant:
     BROKEN     the patched code does not compile or import, which any test would notice
     STALE      the text of the patch does not stand exactly once in the file: it wants rewriting
 
+``to`` keeps every verdict as it falls, and writes a table beside it (FILE.md) at the end. A mutant whose verdict is
+there already is not tried again, unless its patch, the file that it spoils or its tests' files have changed since.
+
 The exit code is 0 if every mutant is killed.
 
-Numba's cache looks at the time and size of kernels.py alone, so a mutant of that file gets an empty cache; the others
-share one, and the file put back keeps its time.
+Numba's cache looks at the time and size of kernels.py; here (``ByFunction``) at what a kernel and all that it calls
+say, so that a mutant compiles what it spoils and nothing else.
 """
 
 from __future__ import annotations
 
-import argparse
+import ast
 import collections
+import functools
+import hashlib
+import inspect
+import json
+import multiprocessing
 import os
 import re
 import shutil
 import signal
-import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from queue import Queue
-from typing import NamedTuple
+from threading import Lock
+from typing import Any, NamedTuple
 
-ROOT = Path(__file__).parents[1]
+HERE = Path(__file__).parent
+ROOT = HERE.parent
 TREE = (
     "erl_torch",
     "tests",
@@ -1137,11 +1147,79 @@ MUTANTS = [
 ]
 
 
+# What tests import, for all of them at once; nothing of the tree itself.
+IMPORTED = ["gymnasium", "hydra", "matplotlib.pyplot", "numba", "pytest", "scipy.sparse.linalg", "scipy.stats", "torch"]
+FORKS = multiprocessing.get_context("forkserver")
+
+
+def _tested(nodes: list[str], tree: Path, said: Path) -> None:
+    """In a process of its own: pytest in ``tree``, its output to ``said``."""
+    import pytest
+
+    os.setsid()  # killed with its children
+    with said.open("wb") as file:
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+    os.chdir(tree)
+    os.environ["PYTHONPATH"] = str(tree)
+    os.environ["PYTHONDONTWRITEBYTECODE"] = "1"
+    sys.dont_write_bytecode = True
+    sys.path[:] = [str(tree), *(entry for entry in sys.path if Path(entry or ".").resolve() not in (ROOT, HERE))]
+    # Plain asserts: what is imported already cannot be rewritten.
+    options = ["-x", "-p", "no:cacheprovider", "--hypothesis-profile=unshrunk", "--tb=short", "--assert=plain"]
+    sys.exit(int(pytest.main([*options, *nodes])))
+
+
+class ByFunction:
+    """Where Numba keeps a compiled function, for NUMBA_CACHE_LOCATOR_CLASSES: by the source that it is made of."""
+
+    def __init__(self, py_func: Any, py_file: str) -> None:
+        self._py_file = py_file
+        self._digest = _sources(py_file)(inspect.unwrap(py_func).__name__)
+
+    @classmethod
+    def from_function(cls, py_func: Any, py_file: str) -> ByFunction:
+        return cls(py_func, py_file)
+
+    def ensure_cache_path(self) -> None:
+        os.makedirs(self.get_cache_path(), exist_ok=True)
+
+    def get_cache_path(self) -> str:
+        return os.environ["NUMBA_CACHE_DIR"]
+
+    def get_source_stamp(self) -> str:
+        return self._digest
+
+    def get_disambiguator(self) -> str:
+        return self._digest
+
+
+@functools.cache
+def _sources(py_file: str) -> Callable[[str], str]:
+    """name -> digest of that function of a file and of all in the file that it leads to."""
+    tree = ast.parse(Path(py_file).read_text())
+    defined = {node.name: node for node in tree.body if isinstance(node, ast.FunctionDef)}
+    calls = {
+        name: {n.id for n in ast.walk(node) if isinstance(n, ast.Name)} & defined.keys()
+        for name, node in defined.items()
+    }
+
+    def digest(name: str) -> str:
+        met, waiting = set(), {name}
+        while waiting:
+            met |= waiting
+            waiting = set().union(*(calls[other] for other in waiting)) - met
+        said = "\n".join(ast.dump(defined[other]) for other in sorted(met))
+        return hashlib.sha256(said.encode()).hexdigest()[:16]
+
+    return digest
+
+
 class Workplace:
     """A copy of the tree, in which one mutant at a time is tried."""
 
     def __init__(self, folder: Path) -> None:
-        self.tree, self.clean, self.spoilt = folder / "tree", folder / "cache", folder / "cache of a mutant"
+        self.tree, self.said = folder / "tree", folder / "said"
         for name in TREE:
             source = ROOT / name
             if source.is_dir():
@@ -1149,39 +1227,27 @@ class Workplace:
             else:
                 shutil.copy2(source, self.tree / name)
 
-    def test(self, nodes: list[str], cache: Path, limit: float) -> tuple[int | None, str]:
+    def test(self, nodes: list[str], limit: float) -> tuple[int | None, str]:
         """(exit code of pytest, or None past the limit; its output)."""
-        options = ["-x", "-p", "no:cacheprovider", "--hypothesis-profile=unshrunk", "--tb=short"]
-        command = [sys.executable, "-B", "-m", "pytest", *options, *nodes]
-        paths = {"PYTHONPATH": str(self.tree), "NUMBA_CACHE_DIR": str(cache)}
-        process = subprocess.Popen(
-            command, cwd=self.tree, env={**os.environ, **paths}, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-            text=True, start_new_session=True,
-        )  # fmt: skip
-        try:
-            said, _ = process.communicate(timeout=limit)
-        except subprocess.TimeoutExpired:
+        process = FORKS.Process(target=_tested, args=(nodes, self.tree, self.said))
+        process.start()
+        process.join(limit)
+        code = process.exitcode
+        if code is None:
             os.killpg(process.pid, signal.SIGKILL)
-            said, _ = process.communicate()
-            return None, said
-        return process.returncode, said
+            process.join()
+        return code, self.said.read_text(errors="replace")
 
     def verdict(self, mutant: Mutant) -> str:
         path = self.tree / "erl_torch" / mutant.file
         text = path.read_text()
         if text.count(mutant.old) != 1 or mutant.old == mutant.new:
             return f"STALE: its text stands {text.count(mutant.old)} times in {mutant.file}"
-        cache = self.clean
-        if mutant.file == "kernels.py":
-            cache = self.spoilt
-            shutil.rmtree(cache, ignore_errors=True)
-        times = path.stat()
         path.write_text(text.replace(mutant.old, mutant.new))
         try:
-            code, said = self.test(mutant.nodes, cache, LIMIT)
+            code, said = self.test(mutant.nodes, LIMIT)
         finally:
             path.write_text(text)
-            os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))
         failed = re.findall(r"^(?:FAILED|ERROR) tests/(\S+)", said, re.M)
         if code is None:
             return "killed by time"
@@ -1194,45 +1260,114 @@ class Workplace:
         return f"killed by {failed[0]}"
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("names", nargs="*", help="parts of the names of the mutants to try; none: all")
-    parser.add_argument("--processes", type=int, default=1, choices=(1, 2))
-    arguments = parser.parse_args()
+class Record:
+    """Verdicts by the names of the mutants, in a file if ``path`` is one."""
+
+    def __init__(self, path: Path | None) -> None:
+        self._path = path
+        self._found: dict[str, dict[str, Any]] = {}
+        if path is not None and path.exists():
+            self._found = json.loads(path.read_text())
+
+    def verdict(self, mutant: Mutant) -> str | None:
+        found = self._found.get(mutant.name)
+        return None if found is None or found["of"] != self._of(mutant) else str(found["verdict"])
+
+    def keep(self, mutant: Mutant, verdict: str, seconds: float) -> None:
+        from erl_torch.files import write_json  # not by ByFunction, which erl_torch is compiled with
+
+        self._found[mutant.name] = {"verdict": verdict, "seconds": round(seconds), "of": self._of(mutant)}
+        if self._path is not None:
+            write_json(self._path, {m.name: self._found[m.name] for m in MUTANTS if m.name in self._found})
+
+    def page(self, mutants: list[Mutant]) -> None:
+        """Write the table of ``mutants``."""
+        from erl_torch.files import write_bytes
+
+        if self._path is None:
+            return
+        rows = [(m, self._found[m.name]) for m in mutants]
+        killed = sum(row["verdict"].startswith("killed") for _, row in rows)
+        lines = [
+            "# Mistakes that the tests notice",
+            "",
+            f"    python benchmarks/mutants.py to={self._path.name}",
+            "",
+            f"{killed} of {len(rows)} killed. Each is one change of the sources, tried against the tests that must",
+            "fail on it: what failed, and the seconds until then.",
+            "",
+            "| file | mistake | | s |",
+            "|---|---|---|---|",
+            *(
+                f"| `{m.file}` | {m.name} | {_cell(row['verdict'])} | {row['seconds']} |"
+                for m, row in sorted(rows, key=lambda row: row[0].file)
+            ),
+        ]
+        write_bytes(self._path.with_suffix(".md"), ("\n".join(lines) + "\n").encode())
+
+    @staticmethod
+    def _of(mutant: Mutant) -> str:
+        """Digest of the patch, the file that it spoils, and the files of its tests."""
+        files = [ROOT / "erl_torch" / mutant.file, *(ROOT / node.split("::")[0] for node in mutant.nodes)]
+        said = [*mutant, *(path.read_text() for path in files)]
+        return hashlib.sha256("\0".join(said).encode()).hexdigest()[:16]
+
+
+def _cell(verdict: str) -> str:
+    by = re.fullmatch(r"killed by (\S+::\S+)", verdict)
+    return f"`{by[1].replace('|', chr(92) + '|')}`" if by else verdict
+
+
+def main(arguments: list[str]) -> int:
+    options = dict(argument.split("=", 1) for argument in arguments if re.match(r"(processes|to)=", argument))
+    parts = [argument for argument in arguments if not re.match(r"(processes|to)=", argument)]
+    processes = int(options.get("processes", 1))
     double = [name for name, n in collections.Counter(m.name for m in MUTANTS).items() if n > 1]
     assert not double, double
-    chosen = [m for m in MUTANTS if not arguments.names or any(part in m.name for part in arguments.names)]
+    chosen = [m for m in MUTANTS if not parts or any(part in m.name for part in parts)]
     if not chosen:
-        parser.error(f"no mutant is named {' or '.join(arguments.names)}")
+        print(f"no mutant is named {' or '.join(parts)}", file=sys.stderr)
+        return 2
+    record = Record(Path(options["to"]) if "to" in options else None)
+    left = [m for m in chosen if record.verdict(m) is None]
     began = time.monotonic()
-    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(arguments.processes) as pool:
+    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(processes) as pool:
+        # Before the process starts that the tests are forked from: Numba reads them once.
+        os.environ["NUMBA_CACHE_DIR"] = str(Path(folder) / "cache")
+        os.environ["NUMBA_CACHE_LOCATOR_CLASSES"] = "benchmarks.mutants.ByFunction"
+        FORKS.set_forkserver_preload(IMPORTED)
         places: Queue[Workplace] = Queue()
-        for i in range(arguments.processes):
+        for i in range(processes):
             places.put(Workplace(Path(folder) / str(i)))
-        first = places.queue[0]
-        code, said = first.test(sorted({node for m in chosen for node in m.nodes}), first.clean, 10 * LIMIT)
-        if code != 0:
-            print(said, "The tests fail without any mutant.", sep="\n")
-            return 1
-        print(f"without a mutant: {said.strip().splitlines()[-1]}", flush=True)
+        if left:
+            code, said = places.queue[0].test(sorted({node for m in left for node in m.nodes}), 10 * LIMIT)
+            if code != 0:
+                print(said, "The tests fail without any mutant.", sep="\n")
+                return 1
+            print(f"without a mutant: {said.strip().splitlines()[-1]}", flush=True)
 
-        def tried(mutant: Mutant) -> str:
+        def tried(mutant: Mutant) -> None:
             place, start = places.get(), time.monotonic()
             try:
                 found = place.verdict(mutant)
             finally:
                 places.put(place)
-            print(f"{mutant.file:32} {mutant.name:52} {time.monotonic() - start:5.0f} s  {found}", flush=True)
-            return found
+            seconds = time.monotonic() - start
+            with keeping:
+                record.keep(mutant, found, seconds)
+            print(f"{mutant.file:32} {mutant.name:52} {seconds:5.0f} s  {found}", flush=True)
 
-        found = list(pool.map(tried, chosen))
-    killed = sum(verdict.startswith("killed") for verdict in found)
-    print(f"\n{killed} of {len(chosen)} killed in {(time.monotonic() - began) / 60:.1f} minutes")
-    for mutant, verdict in zip(chosen, found, strict=True):
+        keeping = Lock()
+        list(pool.map(tried, left))
+    record.page(chosen)
+    found = {m: record.verdict(m) or "" for m in chosen}
+    killed = sum(verdict.startswith("killed") for verdict in found.values())
+    print(f"\n{killed} of {len(chosen)} killed, {len(left)} tried in {(time.monotonic() - began) / 60:.1f} minutes")
+    for mutant, verdict in found.items():
         if not verdict.startswith("killed"):
             print(f"{mutant.file}: {mutant.name}: {verdict}")
     return 0 if killed == len(chosen) else 1
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(sys.argv[1:]))
