@@ -199,7 +199,7 @@ MUTANTS = [
         "kernels.py",
         "healthy = healthy and np.isfinite(x) and x > 0.0",
         "healthy = healthy and np.isfinite(x)",
-        "test_replicas.py::test_a_replica_that_ends_at_0_has_failed",
+        "test_replicas.py::test_a_replica_that_was_at_0_has_failed",
     ),
     Mutant(
         "the shared loop takes another tuple's factor",
@@ -1228,7 +1228,7 @@ MUTANTS = [
         "recordings.py",
         "        self._n += len(chunk)\n",
         "        self._n = len(chunk)\n",
-        "test_streams.py::test_files_are_the_stream_in_memory",
+        "test_streams.py::test_columns_are_written_whole_or_not_at_all",
     ),
     Mutant(
         "a Minari episode that terminates leads to its own start",
@@ -1249,7 +1249,7 @@ MUTANTS = [
         "recordings.py",
         ".sum(2).argmin(1))",
         ".sum(2).argmax(1))",
-        "test_streams.py::test_minari_episodes_become_tuples",
+        "test_streams.py::test_minari_boxes_are_binned",
     ),
     # -- collecting
     Mutant(
@@ -1576,7 +1576,7 @@ class Workplace:
             code, said = self.test(mutant.nodes, LIMIT)
         finally:
             path.write_text(text)
-        failed = re.findall(r"^(?:FAILED|ERROR) tests/(\S+)", said, re.M)
+        failed = re.findall(r"^(?:FAILED|ERROR) tests/(.+?)(?: - .*)?$", said, re.M)
         if code is None:
             return "killed by time"
         if code < 0:
@@ -1594,6 +1594,7 @@ class Record:
     def __init__(self, path: Path | None) -> None:
         self._path = path
         self._found: dict[str, dict[str, Any]] = {}
+        self._digests: dict[str, str] = {}
         if path is not None and path.exists():
             self._found = json.loads(path.read_text())
 
@@ -1633,16 +1634,18 @@ class Record:
         ]
         write_bytes(self._path.with_suffix(".md"), ("\n".join(lines) + "\n").encode())
 
-    @staticmethod
-    def _of(mutant: Mutant) -> str:
-        """Digest of the patch, the file that it spoils, and the files of its tests."""
+    def _of(self, mutant: Mutant) -> str:
+        """Digest of the patch, the file that it spoils, and the files of its tests, as they were when first asked."""
+        if mutant.name in self._digests:
+            return self._digests[mutant.name]
         files = [ROOT / "erl_torch" / mutant.file, *(ROOT / node.split("::")[0] for node in mutant.nodes)]
         said = [*mutant, *(path.read_text() for path in files)]
-        return hashlib.sha256("\0".join(said).encode()).hexdigest()[:16]
+        self._digests[mutant.name] = hashlib.sha256("\0".join(said).encode()).hexdigest()[:16]
+        return self._digests[mutant.name]
 
 
 def _cell(verdict: str) -> str:
-    by = re.fullmatch(r"killed by (\S+::\S+)", verdict)
+    by = re.fullmatch(r"killed by (\S+::.+)", verdict)
     return f"`{by[1].replace('|', chr(92) + '|')}`" if by else verdict
 
 
