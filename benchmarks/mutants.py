@@ -1620,7 +1620,7 @@ class Record:
         lines = [
             "# Mistakes that the tests notice",
             "",
-            f"    python benchmarks/mutants.py to={self._path.name}",
+            f"    python benchmarks/mutants.py to={self._path.as_posix()}",
             "",
             f"{killed} of {len(rows)} killed. Each is one change of the sources, tried against the tests that must",
             "fail on it: what failed, and the seconds until then.",
