@@ -1,6 +1,6 @@
 """Mistakes that somebody could have made, one at a time, each with the tests that must notice it.
 
-    python benchmarks/mutants.py [--processes 1|2] [part of a name ...]      about half an hour of one core
+    python benchmarks/mutants.py [processes=1] [to=FILE.json] [part of a name ...]     about half an hour of one core
 
 A mutant is a patch (a text that stands once in a file, and another for it) and the tests that must fail on it. All
 those tests pass first, without any patch. Then the tree is copied, a patch applied, its tests are run, and the file is
@@ -11,30 +11,40 @@ put back, mutant by mutant. What is found of a mutant:
     BROKEN     the patched code does not compile or import, which any test would notice
     STALE      the text of the patch does not stand exactly once in the file: it wants rewriting
 
+``to`` keeps every verdict as it falls, and writes a table beside it (FILE.md) at the end. A mutant whose verdict is
+there already is not tried again, unless its patch, the file that it spoils or its tests' files have changed since.
+
 The exit code is 0 if every mutant is killed.
 
-Numba's cache looks at the time and size of kernels.py alone, so a mutant of that file gets an empty cache; the others
-share one, and the file put back keeps its time.
+Numba's cache looks at the time and size of kernels.py; here (``ByFunction``) at what a kernel and all that it calls
+say, so that a mutant compiles what it spoils and nothing else. NUMBA_CACHE_DIR, if set, keeps it from run to run.
 """
 
 from __future__ import annotations
 
-import argparse
+import ast
 import collections
+import functools
+import hashlib
+import inspect
+import json
+import multiprocessing
 import os
 import re
 import shutil
 import signal
-import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from queue import Queue
-from typing import NamedTuple
+from threading import Lock
+from typing import Any, NamedTuple
 
-ROOT = Path(__file__).parents[1]
+HERE = Path(__file__).parent
+ROOT = HERE.parent
 TREE = (
     "erl_torch",
     "tests",
@@ -189,7 +199,7 @@ MUTANTS = [
         "kernels.py",
         "healthy = healthy and np.isfinite(x) and x > 0.0",
         "healthy = healthy and np.isfinite(x)",
-        "test_replicas.py::test_a_replica_that_fails_leaves_the_others_alone",
+        "test_replicas.py::test_a_replica_that_was_at_0_has_failed",
     ),
     Mutant(
         "the shared loop takes another tuple's factor",
@@ -289,7 +299,7 @@ MUTANTS = [
         "kernels.py",
         "np.int64(word >> np.uint64(11))) * (1.0 / 9007199254740992.0)",
         "np.int64(word >> np.uint64(12))) * (1.0 / 4503599627370496.0)",
-        "test_replicas.py::test_a_lane_draws_what_numpy_draws",
+        "test_kernels.py::test_uniforms_are_numpys_to_the_last_bit",
     ),
     Mutant(
         "a restart's number is left out of the count",
@@ -1204,14 +1214,410 @@ MUTANTS = [
         '        return ""',
         "test_uncertainty.py::test_interval_is_withheld_where_it_says_nothing",
     ),
+    # -- online
+    Mutant(
+        "rho is moved before its clip at a phase's end",
+        "learners/efficient_s1.py",
+        "log_rho = float(np.clip(log_rho, self.beta * low, self.beta * high))",
+        "log_rho = float(np.clip(log_rho - 1.0, self.beta * low, self.beta * high))",
+        "test_symmetries.py::test_online_rho_is_the_streamed_one_as_far_as_the_certificate_allows",
+    ),
+    Mutant(
+        "rho is moved before its clip in a state that is yielded",
+        "learners/efficient_s1.py",
+        "log_rho=float(np.clip(state.log_rho_in_use, self.beta * low, self.beta * high)),",
+        "log_rho=float(np.clip(state.log_rho_in_use - 1.0, self.beta * low, self.beta * high)),",
+        "test_symmetries.py::test_online_rho_is_the_streamed_one_as_far_as_the_certificate_allows",
+    ),
+    Mutant(
+        "visits of a phase are counted on",
+        "learners/efficient_s1.py",
+        "            fresh=np.zeros_like(state.fresh),\n",
+        "",
+        "test_symmetries.py::test_online_rho_is_the_streamed_one_as_far_as_the_certificate_allows",
+    ),
+    Mutant(
+        "squares of rewards about the mean before",
+        "kernels.py",
+        "reward_squares[k] += off * (r[i] - reward[k])",
+        "reward_squares[k] += off * off",
+        "test_efficient_s1.py::test_online_counts_are_the_empirical_model",
+    ),
+    Mutant(
+        "<V> is of the state left",
+        "kernels.py",
+        "(value[s_next[i]] - mean_value[k]) / visits[k]",
+        "(value[s] - mean_value[k]) / visits[k]",
+        "test_efficient_s1.py::test_a_phase_of_the_online_mode_agrees_with_its_direct_form",
+    ),
+    # -- recordings
+    Mutant(
+        "what is left of a chunk loses a tuple",
+        "transitions.py",
+        "getattr(joined, name)[whole:].copy()",
+        "getattr(joined, name)[whole + 1 :].copy()",
+        "test_streams.py::test_chunks_are_multiples_and_parts_are_kept_in_memory_only",
+    ),
+    Mutant(
+        "a tuple's number is off by one a chunk",
+        "transitions.py",
+        "        t -= len(chunk)\n",
+        "        t -= len(chunk) - 1\n",
+        "test_streams.py::test_a_failure_names_its_tuple_wherever_it_is_read_from",
+    ),
+    Mutant(
+        "a selection takes what is left out",
+        "transitions.py",
+        "(chunk.where(mask) for chunk, mask in found if mask.any())",
+        "(chunk.where(~mask) for chunk, mask in found if not mask.all())",
+        "test_streams.py::test_learners_do_not_see_how_a_stream_is_cut",
+    ),
+    Mutant(
+        "rows that are missing are those that are there",
+        "recordings.py",
+        "self.short = claimed - length",
+        "self.short = length",
+        "test_streams.py::test_short_and_damaged_columns",
+    ),
+    Mutant(
+        "a bad tuple's row counts within its batch",
+        "recordings.py",
+        'f"path={self.path}: {name}[{first + i}]"',
+        'f"path={self.path}: {name}[{i}]"',
+        "test_streams.py::test_bad_tuples_are_named_or_counted",
+    ),
+    Mutant(
+        "a state equal to the size passes in a file",
+        "recordings.py",
+        "column.max() >= self._limits[name]",
+        "column.max() > self._limits[name]",
+        "test_streams.py::test_bad_tuples_are_named_or_counted",
+    ),
+    Mutant(
+        "a header says the last chunk's length",
+        "recordings.py",
+        "        self._n += len(chunk)\n",
+        "        self._n = len(chunk)\n",
+        "test_streams.py::test_columns_are_written_whole_or_not_at_all",
+    ),
+    Mutant(
+        "a Minari episode that terminates leads to its own start",
+        "recordings.py",
+        "s_next[-1] = begins[0]",
+        's_next[-1] = batch["s"][0]',
+        "test_streams.py::test_minari_episodes_become_tuples",
+    ),
+    Mutant(
+        "Minari's a' is the action taken now",
+        "recordings.py",
+        'a_next[:-1] = batch["a"][1:]',
+        'a_next[:-1] = batch["a"][:-1]',
+        "test_streams.py::test_minari_episodes_become_tuples",
+    ),
+    Mutant(
+        "Minari's actions are the furthest",
+        "recordings.py",
+        ".sum(2).argmin(1))",
+        ".sum(2).argmax(1))",
+        "test_streams.py::test_minari_boxes_are_binned",
+    ),
+    # -- collecting
+    Mutant(
+        "a truncated episode leads to the start",
+        "experience.py",
+        "state_next = fresh if terminated and fresh is not None else int(observation)",
+        "state_next = fresh if fresh is not None else int(observation)",
+        "test_experience.py::test_truncation_keeps_the_state_reached",
+    ),
+    Mutant(
+        "a' of a stepped environment comes from the behaviour policy",
+        "experience.py",
+        "action_next = draw(prior_cdf, state_next)",
+        "action_next = draw(behaviour_cdf, state_next)",
+        "test_experience.py::test_law_of_the_stream",
+    ),
+    Mutant(
+        "a reset's reward is a step's",
+        "experience.py",
+        "reward = np.where(restarting, reward, stepped_reward)",
+        "reward = stepped_reward",
+        "test_experience.py::test_vector_environments_give_real_transitions_only",
+    ),
+    Mutant(
+        "s and s' of a vector's tuples change places",
+        "experience.py",
+        "(state, action, reward, after, action_next))",
+        "(after, action, reward, state, action_next))",
+        "test_experience.py::test_vector_environments_give_real_transitions_only",
+    ),
+    Mutant(
+        "a reward is that of the next pair",
+        "experience.py",
+        "reward.ravel()[pair]",
+        "reward.ravel()[pair_next]",
+        "test_experience.py::test_law_of_the_stream",
+    ),
+    Mutant(
+        "restarts are counted anew in every block",
+        "sampling.py",
+        "        self.done += n\n",
+        "",
+        "test_experience.py::test_blocks_do_not_show",
+    ),
+    # -- bins, control tasks, mazes
+    Mutant(
+        "strides of equal dimensions",
+        "envs/discretise.py",
+        "            stride *= n\n",
+        "            stride *= self.bins[0]\n",
+        "test_discretise.py::test_cells_are_those_of_digitize",
+    ),
+    Mutant(
+        "corners of the big-endian cell",
+        "envs/discretise.py",
+        'order="F"',
+        'order="C"',
+        "test_discretise.py::test_corners_enclose_the_cell",
+    ),
+    Mutant(
+        "a bin above the last",
+        "envs/discretise.py",
+        "place = place.clip(0, n - 1)",
+        "place = place.clip(0, n)",
+        "test_discretise.py::test_cells_are_those_of_digitize",
+    ),
+    Mutant(
+        "a box's distribution is big-endian",
+        "envs/discretise.py",
+        "np.outer(one, p).ravel()",
+        "np.outer(p, one).ravel()",
+        "test_discretise.py::test_distribution_of_a_box",
+    ),
+    Mutant(
+        "Discrete actions count from 0",
+        "envs/discretise.py",
+        "np.arange(space.start, space.start + space.n)",
+        "np.arange(space.n)",
+        "test_discretise.py::test_discrete_actions_keep_their_numbers",
+    ),
+    Mutant(
+        "every chunk of a model has the same numbers",
+        "envs/estimate.py",
+        "spawn_key=(chunk,)",
+        "spawn_key=(0,)",
+        "test_control.py::test_rows_of_a_model_share_no_random_numbers",
+    ),
+    Mutant(
+        "a model's rewards keep their largest",
+        "envs/estimate.py",
+        "sampled.reward.reshape(self.space.n_cells, -1) - shift",
+        "sampled.reward.reshape(self.space.n_cells, -1)",
+        "test_control.py::test_model_against_fresh_steps",
+    ),
+    Mutant(
+        "an episode's numbers depend on who still runs",
+        "envs/rollout.py",
+        "a_next = self.draw(prior_cdf, s_next, rng.random(n)[episode])",
+        "a_next = self.draw(prior_cdf, s_next, rng.random(n)[: len(episode)])",
+        "test_control.py::test_an_episode_does_not_depend_on_the_ends_of_others",
+    ),
+    Mutant(
+        "the last step of an episode costs as any other",
+        "envs/rollout.py",
+        "np.where(terminated, 0.0, reward) - self.task.max_reward",
+        "reward - self.task.max_reward",
+        "test_control.py::test_collected_stream",
+    ),
+    Mutant(
+        "rows and columns change places at the border",
+        "envs/grid_world.py",
+        "[[rows - 1], [cols - 1]]",
+        "[[cols - 1], [rows - 1]]",
+        "test_envs.py::test_cliff_is_the_authors",
+    ),
+    Mutant(
+        "the first state is any",
+        "envs/tabular.py",
+        "self.np_random.choice(self.mdp.n_states, p=self.mdp.start)",
+        "self.np_random.choice(self.mdp.n_states)",
+        "test_envs.py::test_steps_follow_the_model_with_every_rule",
+    ),
+    Mutant(
+        "traps stand beside the start",
+        "envs/mazes.py",
+        "near[row - 1 : row + 2, col - 1 : col + 2] = True",
+        "near[row - 1 : row + 2, col - 1 : col + 1] = True",
+        "test_mazes.py",
+    ),
+    Mutant(
+        "wind blows on every tile of a maze",
+        "envs/mazes.py",
+        '        wind *= (tiles == "F").reshape(-1, 1, size, size)\n',
+        "",
+        "test_mazes.py",
+    ),
+    Mutant(
+        "another motor breaks",
+        "envs/shift.py",
+        "(SUCCESS, SUCCESS, SUCCESS, up_success)",
+        "(SUCCESS, up_success, SUCCESS, SUCCESS)",
+        "test_envs.py::test_dynamics_shift_is_figure_4",
+    ),
+    # -- learners beside each other
+    Mutant(
+        "every replica has the first seed",
+        "learners/replicas.py",
+        "seed = int(self.seeds[replica])",
+        "seed = int(self.seeds[0])",
+        "test_replicas.py::test_every_learner_has_replicas",
+    ),
+    Mutant(
+        "the state visited most in the last chunk",
+        "learners/action_value.py",
+        "visits += np.bincount(chunk.s",
+        "visits = np.bincount(chunk.s",
+        "test_streams.py::test_learners_do_not_see_how_a_stream_is_cut",
+    ),
+    Mutant(
+        "the read-out of z in nats",
+        "learners/z_learning.py",
+        "top + np.log(mean) / beta",
+        "top + np.log(mean)",
+        "test_action_value.py::test_read_out_of_z_learning_is_the_mean_over_visits",
+    ),
+    Mutant(
+        "a gap is of the optimum's states",
+        "comparison.py",
+        "max(_mean(own, loss), 0.0) / beta",
+        "max(_mean(best.stationary, loss), 0.0) / beta",
+        "test_comparison.py::test_measures_are_their_definitions",
+    ),
+    Mutant(
+        "KL of a comparison the other way round",
+        "comparison.py",
+        "kl = kl_per_state(best.policy, policy)",
+        "kl = kl_per_state(policy, best.policy)",
+        "test_comparison.py::test_measures_are_their_definitions",
+    ),
+    Mutant(
+        "a fifth is trimmed",
+        "comparison.py",
+        "trim_mean(values, 0.25, axis=axis)",
+        "trim_mean(values, 0.2, axis=axis)",
+        "test_comparison.py::test_interquartile_mean",
+    ),
+    Mutant(
+        "every size of a curve learns from all",
+        "comparison.py",
+        "learner.fit(data.first(size)",
+        "learner.fit(data",
+        "test_comparison.py::test_every_learner_has_the_same_experience",
+    ),
+    Mutant(
+        "resamples of a comparison differ from figure to figure",
+        "comparison.py",
+        "return np.random.default_rng(0)",
+        "return np.random.default_rng()",
+        "test_comparison.py::test_the_same_figures_have_the_same_interval",
+    ),
+    # -- the log
+    Mutant(
+        "constants are not written beside records",
+        "board.py",
+        "self.scalars({**values, **self._lines}, step)",
+        "self.scalars(values, step)",
+        "test_board.py::test_lines_stand_beside_every_record",
+    ),
+    Mutant(
+        "a band is upside down",
+        "board.py",
+        "lower=entry[1], upper=entry[2])",
+        "lower=entry[2], upper=entry[1])",
+        "test_board.py::test_bands_have_their_lower_end_below",
+    ),
+    Mutant(
+        "a run that failed is a success",
+        "board.py",
+        "api_pb2.STATUS_FAILURE",
+        "api_pb2.STATUS_SUCCESS",
+        "test_board.py::test_failed_runs_are_marked",
+    ),
 ]
+
+
+# What tests import, for all of them at once; nothing of the tree itself.
+IMPORTED = ["gymnasium", "hydra", "matplotlib.pyplot", "numba", "pytest", "scipy.sparse.linalg", "scipy.stats", "torch"]
+FORKS = multiprocessing.get_context("forkserver")
+
+
+def _tested(nodes: list[str], tree: Path, said: Path) -> None:
+    """In a process of its own: pytest in ``tree``, its output to ``said``."""
+    import pytest
+
+    os.setsid()  # killed with its children
+    with said.open("wb") as file:
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+    os.chdir(tree)
+    os.environ["PYTHONPATH"] = str(tree)
+    os.environ["PYTHONDONTWRITEBYTECODE"] = "1"
+    sys.dont_write_bytecode = True
+    sys.path[:] = [str(tree), *(entry for entry in sys.path if Path(entry or ".").resolve() not in (ROOT, HERE))]
+    # Plain asserts: what is imported already cannot be rewritten.
+    options = ["-x", "-p", "no:cacheprovider", "--hypothesis-profile=unshrunk", "--tb=short", "--assert=plain"]
+    sys.exit(int(pytest.main([*options, *nodes])))
+
+
+class ByFunction:
+    """Where Numba keeps a compiled function, for NUMBA_CACHE_LOCATOR_CLASSES: by the source that it is made of."""
+
+    def __init__(self, py_func: Any, py_file: str) -> None:
+        self._py_file = py_file
+        self._digest = _sources(py_file)(inspect.unwrap(py_func).__name__)
+
+    @classmethod
+    def from_function(cls, py_func: Any, py_file: str) -> ByFunction:
+        return cls(py_func, py_file)
+
+    def ensure_cache_path(self) -> None:
+        os.makedirs(self.get_cache_path(), exist_ok=True)
+
+    def get_cache_path(self) -> str:
+        return os.environ["NUMBA_CACHE_DIR"]
+
+    def get_source_stamp(self) -> str:
+        return self._digest
+
+    def get_disambiguator(self) -> str:
+        return self._digest
+
+
+@functools.cache
+def _sources(py_file: str) -> Callable[[str], str]:
+    """name -> digest of that function of a file and of all in the file that it leads to."""
+    tree = ast.parse(Path(py_file).read_text())
+    defined = {node.name: node for node in tree.body if isinstance(node, ast.FunctionDef)}
+    calls = {
+        name: {n.id for n in ast.walk(node) if isinstance(n, ast.Name)} & defined.keys()
+        for name, node in defined.items()
+    }
+
+    def digest(name: str) -> str:
+        met, waiting = set(), {name}
+        while waiting:
+            met |= waiting
+            waiting = set().union(*(calls[other] for other in waiting)) - met
+        said = "\n".join(ast.dump(defined[other]) for other in sorted(met))
+        return hashlib.sha256(said.encode()).hexdigest()[:16]
+
+    return digest
 
 
 class Workplace:
     """A copy of the tree, in which one mutant at a time is tried."""
 
     def __init__(self, folder: Path) -> None:
-        self.tree, self.clean, self.spoilt = folder / "tree", folder / "cache", folder / "cache of a mutant"
+        self.tree, self.said = folder / "tree", folder / "said"
         for name in TREE:
             source = ROOT / name
             if source.is_dir():
@@ -1219,40 +1625,28 @@ class Workplace:
             else:
                 shutil.copy2(source, self.tree / name)
 
-    def test(self, nodes: list[str], cache: Path, limit: float) -> tuple[int | None, str]:
+    def test(self, nodes: list[str], limit: float) -> tuple[int | None, str]:
         """(exit code of pytest, or None past the limit; its output)."""
-        options = ["-x", "-p", "no:cacheprovider", "--hypothesis-profile=unshrunk", "--tb=short"]
-        command = [sys.executable, "-B", "-m", "pytest", *options, *nodes]
-        paths = {"PYTHONPATH": str(self.tree), "NUMBA_CACHE_DIR": str(cache)}
-        process = subprocess.Popen(
-            command, cwd=self.tree, env={**os.environ, **paths}, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-            text=True, start_new_session=True,
-        )  # fmt: skip
-        try:
-            said, _ = process.communicate(timeout=limit)
-        except subprocess.TimeoutExpired:
+        process = FORKS.Process(target=_tested, args=(nodes, self.tree, self.said))
+        process.start()
+        process.join(limit)
+        code = process.exitcode
+        if code is None:
             os.killpg(process.pid, signal.SIGKILL)
-            said, _ = process.communicate()
-            return None, said
-        return process.returncode, said
+            process.join()
+        return code, self.said.read_text(errors="replace")
 
     def verdict(self, mutant: Mutant) -> str:
         path = self.tree / "erl_torch" / mutant.file
         text = path.read_text()
         if text.count(mutant.old) != 1 or mutant.old == mutant.new:
             return f"STALE: its text stands {text.count(mutant.old)} times in {mutant.file}"
-        cache = self.clean
-        if mutant.file == "kernels.py":
-            cache = self.spoilt
-            shutil.rmtree(cache, ignore_errors=True)
-        times = path.stat()
         path.write_text(text.replace(mutant.old, mutant.new))
         try:
-            code, said = self.test(mutant.nodes, cache, LIMIT)
+            code, said = self.test(mutant.nodes, LIMIT)
         finally:
             path.write_text(text)
-            os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))
-        failed = re.findall(r"^(?:FAILED|ERROR) tests/(\S+)", said, re.M)
+        failed = re.findall(r"^(?:FAILED|ERROR) tests/(.+?)(?: - .*)?$", said, re.M)
         if code is None:
             return "killed by time"
         if code < 0:
@@ -1264,45 +1658,117 @@ class Workplace:
         return f"killed by {failed[0]}"
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("names", nargs="*", help="parts of the names of the mutants to try; none: all")
-    parser.add_argument("--processes", type=int, default=1, choices=(1, 2))
-    arguments = parser.parse_args()
+class Record:
+    """Verdicts by the names of the mutants, in a file if ``path`` is one."""
+
+    def __init__(self, path: Path | None) -> None:
+        self._path = path
+        self._found: dict[str, dict[str, Any]] = {}
+        self._digests: dict[str, str] = {}
+        if path is not None and path.exists():
+            self._found = json.loads(path.read_text())
+
+    def verdict(self, mutant: Mutant) -> str | None:
+        found = self._found.get(mutant.name)
+        return None if found is None or found["of"] != self._of(mutant) else str(found["verdict"])
+
+    def keep(self, mutant: Mutant, verdict: str, seconds: float) -> None:
+        from erl_torch.files import write_json  # not by ByFunction, which erl_torch is compiled with
+
+        self._found[mutant.name] = {"verdict": verdict, "seconds": round(seconds), "of": self._of(mutant)}
+        if self._path is not None:
+            write_json(self._path, {m.name: self._found[m.name] for m in MUTANTS if m.name in self._found})
+
+    def page(self, mutants: list[Mutant]) -> None:
+        """Write the table of ``mutants``."""
+        from erl_torch.files import write_bytes
+
+        if self._path is None:
+            return
+        rows = [(m, self._found[m.name]) for m in mutants]
+        killed = sum(row["verdict"].startswith("killed") for _, row in rows)
+        lines = [
+            "# Mistakes that the tests notice",
+            "",
+            f"    python benchmarks/mutants.py to={self._path.as_posix()}",
+            "",
+            f"{killed} of {len(rows)} killed. Each is one change of the sources, tried against the tests that must",
+            "fail on it: what failed, and the seconds until then.",
+            "",
+            "| file | mistake | | s |",
+            "|---|---|---|---|",
+            *(
+                f"| `{m.file}` | {m.name} | {_cell(row['verdict'])} | {row['seconds']} |"
+                for m, row in sorted(rows, key=lambda row: row[0].file)
+            ),
+        ]
+        write_bytes(self._path.with_suffix(".md"), ("\n".join(lines) + "\n").encode())
+
+    def _of(self, mutant: Mutant) -> str:
+        """Digest of the patch, the file that it spoils, and the files of its tests, as they were when first asked."""
+        if mutant.name in self._digests:
+            return self._digests[mutant.name]
+        files = [ROOT / "erl_torch" / mutant.file, *(ROOT / node.split("::")[0] for node in mutant.nodes)]
+        said = [*mutant, *(path.read_text() for path in files)]
+        self._digests[mutant.name] = hashlib.sha256("\0".join(said).encode()).hexdigest()[:16]
+        return self._digests[mutant.name]
+
+
+def _cell(verdict: str) -> str:
+    by = re.fullmatch(r"killed by (\S+::.+)", verdict)
+    return f"`{by[1].replace('|', chr(92) + '|')}`" if by else verdict
+
+
+def main(arguments: list[str]) -> int:
+    options = dict(argument.split("=", 1) for argument in arguments if re.match(r"(processes|to)=", argument))
+    parts = [argument for argument in arguments if not re.match(r"(processes|to)=", argument)]
+    processes = int(options.get("processes", 1))
     double = [name for name, n in collections.Counter(m.name for m in MUTANTS).items() if n > 1]
     assert not double, double
-    chosen = [m for m in MUTANTS if not arguments.names or any(part in m.name for part in arguments.names)]
+    chosen = [m for m in MUTANTS if not parts or any(part in m.name for part in parts)]
     if not chosen:
-        parser.error(f"no mutant is named {' or '.join(arguments.names)}")
+        print(f"no mutant is named {' or '.join(parts)}", file=sys.stderr)
+        return 2
+    record = Record(Path(options["to"]) if "to" in options else None)
+    left = [m for m in chosen if record.verdict(m) is None]
     began = time.monotonic()
-    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(arguments.processes) as pool:
+    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(processes) as pool:
+        # Before the process starts that the tests are forked from: Numba reads them once.
+        os.environ.setdefault("NUMBA_CACHE_DIR", str(Path(folder) / "cache"))
+        os.environ["NUMBA_CACHE_LOCATOR_CLASSES"] = "benchmarks.mutants.ByFunction"
+        FORKS.set_forkserver_preload(IMPORTED)
         places: Queue[Workplace] = Queue()
-        for i in range(arguments.processes):
+        for i in range(processes):
             places.put(Workplace(Path(folder) / str(i)))
-        first = places.queue[0]
-        code, said = first.test(sorted({node for m in chosen for node in m.nodes}), first.clean, 10 * LIMIT)
-        if code != 0:
-            print(said, "The tests fail without any mutant.", sep="\n")
-            return 1
-        print(f"without a mutant: {said.strip().splitlines()[-1]}", flush=True)
+        if left:
+            code, said = places.queue[0].test(sorted({node for m in left for node in m.nodes}), 10 * LIMIT)
+            if code != 0:
+                print(said, "The tests fail without any mutant.", sep="\n")
+                return 1
+            print(f"without a mutant: {said.strip().splitlines()[-1]}", flush=True)
 
-        def tried(mutant: Mutant) -> str:
+        def tried(mutant: Mutant) -> None:
             place, start = places.get(), time.monotonic()
             try:
                 found = place.verdict(mutant)
             finally:
                 places.put(place)
-            print(f"{mutant.file:32} {mutant.name:52} {time.monotonic() - start:5.0f} s  {found}", flush=True)
-            return found
+            seconds = time.monotonic() - start
+            with keeping:
+                record.keep(mutant, found, seconds)
+            print(f"{mutant.file:32} {mutant.name:52} {seconds:5.0f} s  {found}", flush=True)
 
-        found = list(pool.map(tried, chosen))
-    killed = sum(verdict.startswith("killed") for verdict in found)
-    print(f"\n{killed} of {len(chosen)} killed in {(time.monotonic() - began) / 60:.1f} minutes")
-    for mutant, verdict in zip(chosen, found, strict=True):
+        keeping = Lock()
+        list(pool.map(tried, left))
+    record.page(chosen)
+    found = {m: record.verdict(m) or "" for m in chosen}
+    killed = sum(verdict.startswith("killed") for verdict in found.values())
+    print(f"\n{killed} of {len(chosen)} killed, {len(left)} tried in {(time.monotonic() - began) / 60:.1f} minutes")
+    for mutant, verdict in found.items():
         if not verdict.startswith("killed"):
             print(f"{mutant.file}: {mutant.name}: {verdict}")
     return 0 if killed == len(chosen) else 1
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(sys.argv[1:]))

@@ -127,6 +127,25 @@ def test_charts_are_those_that_have_data():
     assert len(board.layout(["s1/theta"], [])[board.CONVERGENCE]) == 1  # no band is known
 
 
+def test_bands_have_their_lower_end_below():
+    """Of a run and of replicas, as TensorBoard's own message has them."""
+    one = board.layout(["s1/theta"], ["optimal/theta", "optimal/theta_lower", "data/theta", "data/theta_lower"])
+    many = board.replica_layout({"all": ["theta"]}, ["theta"])
+    ends = {
+        (series.value, series.lower, series.upper)
+        for boards in (one, many)
+        for category in board._layout(boards).category
+        for chart in category.chart
+        for series in chart.margin.series
+    }
+    assert ends >= {
+        ("optimal/theta", "optimal/theta_lower", "optimal/theta_upper"),
+        ("data/theta", "data/theta_lower", "data/theta_upper"),
+        ("all/theta_mean", "all/theta_q25", "all/theta_q75"),
+        ("all/theta_median", "all/theta_min", "all/theta_max"),
+    }
+
+
 def test_jobs_of_a_sweep_are_shown_side_by_side():
     assert where(Path("runs/windy_cliff/sweep-1/000-seed=0"))[1] == Path("runs/windy_cliff/sweep-1")
     assert where(Path("runs/windy_cliff/1"))[1] == "runs"

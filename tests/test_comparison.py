@@ -1,9 +1,6 @@
 """The comparison of learners: figures against direct evaluation, same bits for any number of processes."""
 
 import json
-import os
-import subprocess
-import sys
 
 import numpy as np
 import oracle
@@ -14,7 +11,7 @@ from matplotlib.image import imread
 
 from erl_torch import AlgorithmS1, InputError, TabularMDP, cli, collect, config, pictures, solve_soft_bellman
 from erl_torch.comparing import run_comparison
-from erl_torch.comparison import MEASURES, compare, interquartile_mean, measure, optimum
+from erl_torch.comparison import MEASURES, _statistics, compare, interquartile_mean, measure, optimum
 from erl_torch.evaluation import objective
 from erl_torch.learners import LEARNERS, DifferentialSoftQ, SoftQ
 
@@ -124,6 +121,11 @@ def test_processes_change_nothing(problem):
     for name in set(MEASURES) - {"seconds"}:
         np.testing.assert_array_equal(one.measures[name], two.measures[name])
     assert one.status == two.status
+
+
+def test_the_same_figures_have_the_same_interval():
+    values = np.random.default_rng(0).random(12)
+    assert _statistics(values) == _statistics(values.copy())
 
 
 def test_one_seed_has_no_interval_and_a_failure_no_figure(problem):
@@ -243,16 +245,13 @@ def test_recorded_experience_is_refused(tmp_path):
         run_comparison(cfg, tmp_path)
 
 
-def test_command_line(tmp_path):
-    done = subprocess.run(
-        [sys.executable, str(ROOT / "compare.py"), *SMALL, PAIR, "n_sizes=1"],
-        cwd=tmp_path, capture_output=True, text=True, timeout=120, env={**os.environ, "PYTHONPATH": str(ROOT)},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
+def test_command_line(tmp_path, typed_here):
+    code, out, err = typed_here("compare.py", *SMALL, PAIR, "n_sizes=1")
+    assert code == 0, err
     (directory,) = (tmp_path / "runs" / "windy_cliff").iterdir()
     assert directory.name.startswith("compare-")
     assert {".hydra", "compare.json", "compare.png"} == {p.name for p in directory.iterdir()}
-    lines = done.stdout.splitlines()
+    lines = out.splitlines()
     rows = [line.split() for line in lines if line.startswith(("differential_soft_q", "soft_q"))]
     result = json.loads((directory / "compare.json").read_text())
     for row in rows:

@@ -1,6 +1,7 @@
 """Classic control: batched dynamics, estimated models and rollouts, all against Gymnasium's env.step."""
 
 import math
+from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
@@ -13,6 +14,7 @@ import erl_torch
 from erl_torch import InputError, collect_rollouts, estimate_mdp, rollout, solve_soft_bellman
 from erl_torch.envs import CONTROL_ENTRY_POINTS, CONTROL_EPISODE_LENGTH, CONTROL_TASKS, estimate
 from erl_torch.envs.control import control_task
+from erl_torch.envs.rollout import _Player
 
 IDS = sorted(CONTROL_ENTRY_POINTS)
 # The reward that the paper's model pays, of a step that Gymnasium made: (the original after it, its reward).
@@ -160,6 +162,23 @@ def test_model_does_not_depend_on_the_workers(name):
     assert not equal(one, estimate_mdp(name, SMALL[name], n_samples=n_samples, seed=1, cache=False))
 
 
+def test_rows_of_a_model_share_no_random_numbers(monkeypatch):
+    """Where in its cell a sample lies, whatever chunk its row belongs to."""
+    monkeypatch.setattr(estimate, "CHUNK", 100)
+    task, seen = control_task("pendulum"), []
+
+    def step(state, value):
+        seen.append(state.numpy().reshape(-1, 10, 2))
+        return task.step(state, value)
+
+    estimate_mdp(replace(task, step=step), 6, n_samples=10, workers=1, cache=False)
+    assert len(seen) == 11
+    low, high = np.array(task.low), np.array(task.high)
+    place = np.concatenate(seen) - low  # [rows, n, d]
+    within = (place / ((high - low) / 6)) % 1
+    assert len(np.unique(within.round(9).reshape(-1, 2), axis=0)) == 36 * len(task.actions) * 10
+
+
 def test_model_of_other_settings():
     model = estimate_mdp("pendulum", [5, 3], [-1.0, -2.0], [1.0, 2.0], actions=[0.5], n_samples=50, start="uniform")
     assert model.mdp.reward.shape == (15, 1)
@@ -290,6 +309,28 @@ def test_deterministic_rollouts_are_gymnasiums_episodes(name, steps):
     if name in ("mountain_car", "cart_pole"):
         assert played.lengths.max() < steps or name == "cart_pole"
         assert played.lengths.min() < steps
+
+
+@pytest.mark.parametrize("apart", [False, True])
+def test_an_episode_does_not_depend_on_the_ends_of_others(apart):
+    """Where no episode ends, each is the same up to where it would have ended."""
+    task = control_task("cart_pole")
+
+    def endless(state, value):
+        step = task.step(state, value)
+        return step._replace(terminated=torch.zeros_like(step.terminated))
+
+    policy = np.tile([0.4, 0.6], (8**4, 1))
+    prior = np.full((8**4, 2), 0.5) if apart else None
+    ticks = []
+    for played in (task, replace(task, step=endless)):
+        player = _Player(played, None, None, "original")
+        first = task.initial(40, np.random.default_rng(1))
+        ticks.append(list(player.play(first, policy, prior, 40, np.random.default_rng(2))))
+    assert len(ticks[0][-1].episode) < 30 < len(ticks[1][-1].episode)
+    for one, other in zip(*ticks, strict=True):
+        for name in ("s", "a", "s_next", "a_next"):
+            assert np.array_equal(getattr(one, name), getattr(other, name)[one.episode])
 
 
 def test_random_rollouts_have_gymnasiums_law():

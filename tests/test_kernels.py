@@ -8,7 +8,7 @@ import pytest
 from erl_torch import TabularMDP, Transitions, kernels
 from erl_torch.empirical import tally
 from erl_torch.evaluation import Judge, reward_per_step
-from erl_torch.sampling import _levels, policy_cdf, sampling_tables
+from erl_torch.sampling import _levels, _words, policy_cdf, sampling_tables
 
 BELOW_1 = math.nextafter(1.0, 0.0)
 
@@ -22,6 +22,14 @@ def test_draws_are_of_half_open_intervals(x):
     low, length = np.full(5, 2, np.uint64), np.full(5, 6, np.uint64)
     kernels._draw_lanes(cdf, low, length, _levels(6), np.full(5, x))
     assert (low == expected).all()
+
+
+def test_uniforms_are_numpys_to_the_last_bit():
+    generators = [np.random.default_rng(seed) for seed in range(3)]
+    state, out = _words(generators), np.empty((500, 3))
+    kernels._uniforms(state, out[:200], 200)
+    kernels._uniforms(state, out[200:], 300)
+    assert np.array_equal(out, np.stack([generator.random(500) for generator in generators], axis=1))
 
 
 def test_lanes_draw_from_rows_of_any_length():

@@ -288,6 +288,20 @@ def test_a_failure_later_on_keeps_the_last_good_epoch():
         assert_same(found[r], learner.fit(data[r], 2, 1))
 
 
+def test_a_replica_that_was_at_0_has_failed():
+    """Halved 1074 times, 1 is the smallest number; once more, and it is 0. In a self-loop the listing's rho does not
+    see it, and what comes afterwards lifts u again."""
+    n = 1075
+    zeros, after = np.zeros(n + 25, int), np.arange(n + 25) // n
+    data = [Transitions(zeros, zeros, np.where(after == 0, r, -1.0), after, zeros) for r in (-1.0, -100.0, -1.0)]
+    learner = ListedS1(beta=10.0, lr_u=0.5, lr_rho=1e-3, n_epochs=1, n_bias=1, rescale_every=n)
+    found = Replicas.of(learner, 3).fit(data, 2, 1)
+    assert set(found.failures) == {1}
+    assert "no longer a positive finite number at tuple 1074 (s=0, a=0, r=-100)" in found[1].message
+    for r in range(3):
+        assert_same(found[r], learner.fit(data[r], 2, 1))
+
+
 def test_rewards_that_overflow_fail_by_name():
     data = Transitions([0], [0], [100.0], [0], [0])
     found = Replicas.of(AlgorithmS1(n_epochs=1), beta=[1.0, 10.0]).fit(data, 1, 1)

@@ -30,8 +30,9 @@ from erl_torch import (
     save_columns,
 )
 from erl_torch.empirical import empirical_mdp, tally
+from erl_torch.envs.discretise import Discretise
 from erl_torch.learners import LEARNERS
-from erl_torch.recordings import ColumnWriter, check_target
+from erl_torch.recordings import ColumnWriter, _Minari, check_target
 from erl_torch.rng import streams
 from erl_torch.training import train
 from erl_torch.transitions import COLUMNS, Parts, regroup
@@ -278,6 +279,8 @@ def test_columns_are_written_whole_or_not_at_all(tmp_path):
     assert record(MDP, path, 13, 1000, 1) == path
     assert open_recording(path, 5, 3).checksum() == PLAIN.checksum()
     assert np.array_equal(np.load(path / "s_next.npy", mmap_mode="r"), PLAIN.s_next)
+    save_columns(Cut(PLAIN, 999), path)
+    assert open_recording(path, 5, 3).checksum() == PLAIN.checksum()
     save_columns(SHORT, path)  # replaced
     assert len(open_recording(path, 5, 3)) == 40
     assert [p.name for p in (tmp_path / "deep").iterdir()] == ["t"]
@@ -455,6 +458,16 @@ def test_minari_episodes_become_tuples(tmp_path, monkeypatch):
         open_recording("minari:erl/test-v0", 2, 3)
     with pytest.raises(InputError, match="none-v0: must be a readable Minari data set"):
         open_recording("minari:erl/none-v0", 5, 3)
+
+
+def test_minari_boxes_are_binned():
+    """Observations by the environment's own bins, actions by the nearest of its values."""
+    env = Discretise(gym.make("Pendulum-v1"), 4, actions=5)  # -2, -1, 0, 1, 2
+    source = _Minari("minari:none", env, np.full((64, 5), 0.2), False, 0)
+    actions = np.array([[1.2], [-1.6], [2.0], [0.4]], np.float32)
+    assert source._actions(actions, env.env).tolist() == [3, 0, 4, 2]
+    seen = np.array([[-0.9, 0.1, 7.0], [0.9, -0.6, -1.0]])
+    assert source._states(seen, env.env.observation_space).tolist() == [0 + 2 * 4 + 3 * 16, 3 + 0 * 4 + 1 * 16]
 
 
 def kept(path):
