@@ -15,17 +15,17 @@ The interval is that of the likelihood (Owen's, with a successor that was never 
 
     sum_{s,a} n(s,a) (sum_s' p log(p/q) + dr^2 / (2 Var(r | s,a,s'))) <= t^2 / 2,
 
-p the frequencies, q the model's rows, dr what its mean reward is off beyond what q makes of it. Rows are free; any may
-lead, besides where it was seen to lead, to the best state or to the worst. So a row of n draws may hide an event of
-chance 1 - exp(-t^2/2n) (the rule of three), few events make it wide and lopsided, and it bends as J does. Where much
-was seen it is value -+ t se. Each end is found by steps: the models that are worst to first order, J there, and on.
+p the frequencies, q the model's rows, dr what its mean reward is off beyond what q makes of it. A row may also lead
+where another action leads that shares its state and a successor with it, or, where a successor has one draw alone,
+anywhere: n draws may hide an event of chance 1 - exp(-t^2/2n). Few events make the interval wide and lopsided; where
+much was seen it is value -+ t se. Each end is found by steps: the models that are worst to first order, J there, and on.
 
 What is assumed: the draws of a pair are independent and alike, noise in the reward of one (s,a,s') is about normal in
-its mean, and an unseen successor is no better and no worse than the states that were seen. Then
+its mean, and what was seen nowhere (a state, a penalty) is not there. Then
 
     second order  noise in the rows moves J on average (the optimum of a model with errors picks among its errors and
                   looks better than it is): derived in docs/theory.md, 4, and taken off
-    never tried   pairs, were they as good as those tried in their state, widen one side
+    never tried   pairs widen one side, were they to bring the best that was seen from their state
 
 ``smallest_visits`` is the fewest draws of a pair behind at least 1% of the variance; ``withheld`` says why there is no
 interval, where there is none.

@@ -190,7 +190,7 @@ def test_interval_is_withheld_where_it_says_nothing():
 
 def test_pairs_never_tried_widen_one_side():
     """Action 1 of state 0 is never tried. Both actions of state 1 lead half and half, so V(1) = V(0) + log(2)/beta;
-    were the untried one to lead to state 1, it would add sqrt(2) to 1 in the soft maximum of state 0, half of the time."""
+    were the untried one to lead to state 1, it would add sqrt(2) to 1 in the soft maximum of state 0, half the time."""
     rng = np.random.default_rng(0)
     s_next = rng.integers(0, 2, 40_000)
     s = np.concatenate([[0], s_next[:-1]])
