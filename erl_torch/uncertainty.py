@@ -18,7 +18,7 @@ The interval is that of the likelihood (Owen's, with a successor that was never 
 p the frequencies, q the model's rows, dr what its mean reward is off beyond what q makes of it. A row may also lead
 where another action leads that shares its state and a successor with it, or, where a successor has one draw alone,
 anywhere: n draws may hide an event of chance 1 - exp(-t^2/2n). Few events make the interval wide and lopsided; where
-much was seen it is value -+ t se. Each end is found by steps: the models that are worst to first order, J there, and on.
+much was seen it is value -+ t se. Each end is found by steps: to the models worst to first order, J there, and on.
 
 What is assumed: the draws of a pair are independent and alike, noise in the reward of one (s,a,s') is about normal in
 its mean, and what was seen nowhere (a state, a penalty) is not there. Then
