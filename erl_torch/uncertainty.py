@@ -65,7 +65,7 @@ SIGNS = 100
 LOPSIDED = 0.1  # the middle's distance from the value, in half widths
 HALF = 0.5  # of the plug-in's standard error, that of resamples at least
 MAX_STEPS = 50
-FAR = 300.0  # exp of it, and of its double, are finite
+FAR = 100.0  # logarithm of the price at which likelihood is given away
 CLOSE = 0.01  # part of the half width by which an end of the interval may fall short
 
 
@@ -362,8 +362,10 @@ def _furthest(
         x = given + now.value[p.indices]
         x = x - np.add.reduceat(p.data * x, p.indptr[:-1])[row]
         unit = max(float((slope[row] * x).max()), float(np.abs(slope * np.sqrt(noise)).max()))
-        if not (np.isfinite(unit) and unit > 0):
-            return best if unit == 0 else sign * np.inf
+        if not np.isfinite(unit):
+            return sign * np.inf
+        if unit <= 1e-30 * float(np.abs(slope).max()) * float(np.abs(x).max()):  # none but by rounding
+            return best
         slope = slope / unit
 
         def spent(log_price: float, slope: np.ndarray = slope, x: np.ndarray = x) -> float:
