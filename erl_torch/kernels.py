@@ -1067,6 +1067,58 @@ def tilt_rows(indptr, indices, data, h, log_mean, kl, tilted):
         kl[row] = max(average - log_total, 0.0)
 
 
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def likelihood_rows(indptr, data, x, slope, moved, cost):
+    """Row by row, q that maximises slope * sum_j q_j x_j - sum_j p_j log(p_j/q_j), for slope [rows] of any sign.
+
+    CSR rows p that sum to 1; x [entries]. An entry of probability 0 may be given mass: that of a successor not seen.
+    Fills moved with q (as data) and cost [rows] with sum_j p_j log(p_j/q_j). Stationary where q_j = p_j/(eta - y_j),
+    y = slope (x - mean): eta is the root of sum_j q_j = 1 above the largest y, or that y itself, where what is seen
+    leaves mass over.
+    """
+    for row in range(indptr.size - 1):
+        first, last = indptr[row], indptr[row + 1]
+        mean = 0.0
+        for m in range(first, last):
+            mean += data[m] * x[m]
+        top, place = 0.0, first
+        for m in range(first, last):
+            moved[m] = data[m]
+            if slope[row] * (x[m] - mean) > top:
+                top, place = slope[row] * (x[m] - mean), m
+        cost[row] = 0.0
+        if not top > 0:
+            continue
+        low, high = 0.0, 1.0  # of above = eta - top
+        above = 1.0 - top if top < 1 else 1.0
+        for _ in range(200):
+            total, square = 0.0, 0.0
+            for m in range(first, last):
+                if data[m] > 0:
+                    gap = above + (top - slope[row] * (x[m] - mean))
+                    total += data[m] / gap
+                    square += data[m] / gap**2
+            if total < 1:
+                high = above
+            else:
+                low = above
+            new = above + total * (total - 1) / square  # Newton's step on 1/total, which is all but linear
+            if not low < new < high:
+                new = 0.5 * (low + high)
+            if abs(new - above) <= 1e-14 * above or not low < new < high:
+                break
+            above = new
+        left = 1.0
+        for m in range(first, last):
+            if data[m] > 0:
+                gap = above + (top - slope[row] * (x[m] - mean))
+                moved[m] = data[m] / gap
+                left -= moved[m]
+                cost[row] += data[m] * math.log(gap)
+        if data[place] == 0:
+            moved[place] = max(left, 0.0)
+
+
 @numba.njit(cache=True, error_model="numpy")
 def lazy_power(indptr, indices, data, y, steps):
     """``steps`` steps y <- y/max(y) + M y/max(M y) of a CSR matrix; y [n] > 0 changes in place."""

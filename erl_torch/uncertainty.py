@@ -11,17 +11,24 @@ theta* = -J(pi*): to move pi* with the data is of second order (J is flat there)
 sample of (s,a) takes d^2 Var (1/n - 1/(n+1)) = d^2 Var / (n (n+1)) off the variance: the pair where that is largest
 comes first.
 
-What is assumed: the draws of a pair are independent and alike, and every pair and successor that matters has been seen
-more than a few times (``smallest_visits`` is the fewest draws of a pair behind at least 1% of the variance). Where that
-is nearly so the interval makes up for it, and where it is not there is none (``withheld`` says why):
+The interval is that of the likelihood (Owen's, with a successor that was never seen): all values of J of models with
 
-    rare events   the variance of a count grows with the count: a score interval, skewed as the data are, with
-                  Student's t for the variance's own error
+    sum_{s,a} n(s,a) (sum_s' p log(p/q) + dr^2 / (2 Var(r | s,a,s'))) <= t^2 / 2,
+
+p the frequencies, q the model's rows, dr what its mean reward is off beyond what q makes of it. A row may also lead
+where another action leads that shares its state and a successor with it, or, where a successor has one draw alone,
+anywhere: n draws may hide an event of chance 1 - exp(-t^2/2n). Few events make the interval wide and lopsided; where
+much was seen it is value -+ t se. Each end is found by steps: to the models worst to first order, J there, and on.
+
+What is assumed: the draws of a pair are independent and alike, noise in the reward of one (s,a,s') is about normal in
+its mean, and what was seen nowhere (a state, a penalty) is not there. Then
+
     second order  noise in the rows moves J on average (the optimum of a model with errors picks among its errors and
                   looks better than it is): derived in docs/theory.md, 4, and taken off
-    unseen        successors: a row brings a new one about as often as draws have had one of their own (Good and
-                  Turing), worth anyone's value; a pair seen once shows no variance and is given the largest of the
-                  others; pairs never tried, were they as good as those tried in their state, widen one side
+    never tried   pairs widen one side, were they to bring the best that was seen from their state
+
+``smallest_visits`` is the fewest draws of a pair behind at least 1% of the variance; ``withheld`` says why there is no
+interval, where there is none.
 
 A state that the data never show is no part of the problem (``erl_torch.empirical``), nor of the error.
 
@@ -31,27 +38,35 @@ successor), and solves each model: it sees the second order, and takes off nothi
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from statistics import NormalDist
 from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
-from scipy import special
+from scipy import optimize, special
 
-from erl_torch import checks
+from erl_torch import checks, kernels
+from erl_torch.certificates import soft_backup
 from erl_torch.chains import SingularChainError
 from erl_torch.checks import InputError
 from erl_torch.empirical import EmpiricalMDP, EmpiricalProblem
 from erl_torch.evaluation import kl_per_state
 from erl_torch.mdp import check_policy
 from erl_torch.solution import Status
+from erl_torch.solvers.problem import Problem
 from erl_torch.solvers.soft_bellman import solve_problem
 
 COUNTS = 0.01  # share of the variance from which a pair counts
-BIAS_STATES = 1000  # beyond, the second order is left out: it takes a dense inverse
+BIAS_STATES = 1000  # beyond, the second order is an average over random signs: exact, it takes S linear systems
+SIGNS = 100
 LOPSIDED = 0.1  # the middle's distance from the value, in half widths
-FEWEST = 3.0  # independent events at least behind an interval
+HALF = 0.5  # of the plug-in's standard error, that of resamples at least
+MAX_STEPS = 50
+FAR = 100.0  # logarithm of the price at which likelihood is given away
+CLOSE = 0.01  # part of the half width by which an end of the interval may fall short
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,19 +80,18 @@ class Estimate:
     samples: np.ndarray | None = None  # of the bootstrap, [n]
     variance: np.ndarray | None = None  # what each pair adds to standard_error^2, [S, A]; plug-in
     visits: np.ndarray | None = None  # [S, A]
-    third: float = 0.0  # third central moment of the estimate
-    freedom: float = np.inf  # degrees of freedom of standard_error, as of Student's t
+    freedom: float = np.inf  # of standard_error, as of Student's t
     bias: float = 0.0  # of second order; taken off ``value`` already
     untried: tuple[float, float] = (0.0, 0.0)  # by how much pairs never visited may lower and raise the figure
     smallest_visits: int | None = None  # of the pairs behind at least 1% of the variance
     withheld: str = ""  # why there is no interval, if there is none
+    limits: Callable[[float], tuple[float, float]] | None = None  # figures of log-likelihood down by as much; plug-in
 
     def interval(self, level: float = 0.95) -> tuple[float, float]:
         """Two-sided; infinite where it is withheld. Of a bootstrap the basic one (samples mirrored at the value).
 
-        Of a plug-in estimate the score interval whose variance grows along the figure as its skewness says: all T with
-        (value - T)^2 <= t^2 (se^2 + (third/se^2) (T - value)), t of Student's distribution. For a count of rare events
-        that is Wilson's; without skewness value -+ t se. What was never tried comes on top.
+        Of a plug-in estimate that of the likelihood, down by t^2/2, t of Student's distribution; what was never tried
+        comes on top.
         """
         level = checks.number("level", level, lambda x: 0 < x < 1, "a number in (0, 1)")
         if self.withheld:
@@ -86,10 +100,10 @@ class Estimate:
             low, high = np.quantile(self.samples, [(1 - level) / 2, (1 + level) / 2])
             return 2 * self.value - float(high), 2 * self.value - float(low)
         t = float(special.stdtrit(self.freedom, (1 + level) / 2)) if np.isfinite(self.freedom) else _normal(level)
-        variance = self.standard_error**2
-        shift = 0.5 * t**2 * self.third / variance if variance > 0 else 0.0
-        half = float(np.sqrt(shift**2 + t**2 * variance))
-        return self.value + shift - half - self.untried[0], self.value + shift + half + self.untried[1]
+        low, high = self.value - t * self.standard_error, self.value + t * self.standard_error
+        if self.limits is not None:
+            low, high = self.limits(0.5 * t**2)
+        return low - self.untried[0], high + self.untried[1]
 
     def next_samples(self, n: int = 5) -> list[tuple[int, int, float]]:
         """The n pairs (s, a, drop of the variance by one more sample), best first. Plug-in estimates only."""
@@ -139,13 +153,14 @@ def theta_uncertainty(model: EmpiricalMDP, beta: float, prior_policy: Any = None
         assert bounds is not None
         reason = "the optimal policy's chain falls into parts that double precision cannot join"
         return Estimate("theta", 0.5 * sum(bounds), np.inf, withheld=reason)
+    limits = found.limits
     return replace(
         found,
         name="theta",
         value=-found.value,
-        third=-found.third,
         bias=-found.bias,
         untried=found.untried[::-1],
+        limits=None if limits is None else lambda budget: (-limits(budget)[1], -limits(budget)[0]),
     )
 
 
@@ -194,10 +209,7 @@ def bootstrap_theta(
     seed = checks.seed("seed", seed)
     checks.at_least("n_resamples", n_resamples, 2)
     rng = np.random.default_rng(seed)
-    part = model.problem(beta, prior_policy)
-    bounds = solve_problem(part.problem, model, prior_policy).theta_bounds
-    assert bounds is not None
-    value = 0.5 * sum(bounds)
+    plug_in = theta_uncertainty(model, beta, prior_policy)
     p, visits = model.transition, model.visits.ravel()
     rows = np.repeat(np.arange(len(visits)), np.diff(p.indptr))
     within = _within(model, p.data, rows)
@@ -219,49 +231,79 @@ def bootstrap_theta(
             samples.append(solution.theta)
     if len(samples) < 2:
         raise InputError("transitions", f"a stream with {len(samples)} solvable resamples", "longer")
-    return Estimate("theta", value, float(np.std(samples, ddof=1)), samples=np.array(samples))
+    error = float(np.std(samples, ddof=1))
+    withheld = plug_in.withheld
+    if not withheld and error < HALF * plug_in.standard_error:
+        withheld = "the resamples vary less than the draws: pairs that matter were drawn too few times"
+    return Estimate("theta", plug_in.value + plug_in.bias, error, samples=np.array(samples), withheld=withheld)
 
 
 def _plug_in(model: EmpiricalMDP, part: EmpiricalProblem, policy: np.ndarray, optimal: bool) -> Estimate:
     """J of ``policy`` [n, A], on the problem's states; ``optimal``: it moves with the data."""
     problem = part.problem
-    prior = np.where(policy > 0, problem.prior, 1.0)
-    reward = (policy * problem.reward).sum(1) - kl_per_state(policy, prior) / problem.beta
-    lu = problem.regeneration(policy)
-    gain, relative = lu.poisson(reward)
+    here = _worth(problem, policy)
     d, value = np.zeros(model.visits.shape), np.zeros(model.n_states)
-    d[problem.states], value[problem.states] = lu.stationary()[:, None] * policy, relative
-    rows = _rows(model, part, value)
-    n = np.maximum(rows.n, 1.0)
-    weight = np.where(part.used, d**2 / n, 0.0)
-    variance = weight * rows.variance
-    total = float(variance.sum())
-    third = float((weight * d / n * rows.third).sum())
-    # Twice the squared variance over the variance of its own estimate, less what the skewness explains.
-    with np.errstate(invalid="ignore", divide="ignore"):
-        explained = np.where(rows.variance > 0, rows.third**2 / rows.variance, 0.0)
-    spread = np.maximum(rows.fourth - rows.variance**2 - explained, 0.0)
-    freedom = 2 * total**2 / max(float((weight**2 * spread / n).sum()), 1e-300) if total > 0 else np.inf
-    bias = _second_order(model, part, policy, rows, value, optimal)
-    untried = _untried(model, part, d) if optimal else 0.0
-    withheld = _withheld(total, third, bias, untried)
-    if withheld:  # a correction that cannot be trusted is none
-        bias = 0.0
+    d[problem.states], value[problem.states] = here.d, here.value
+    with np.errstate(over="ignore", invalid="ignore"):
+        rows = _rows(model, part, value)
+        weight = np.where(part.used, d**2 / np.maximum(rows.n, 1.0), 0.0)
+        variance = weight * rows.variance
+        total = float(variance.sum())
+        bias, bias_error = _second_order(model, part, here, policy, rows, optimal)
+        # Welch and Satterthwaite.
+        unsure = float(((variance / total) ** 2 / np.maximum(rows.n - 1, 1)).sum()) if total > 0 else 0.0
+    untried = _untried(part, here) if optimal else 0.0
     counts = np.flatnonzero(variance > COUNTS * total)
-    fewest = int(model.visits.flat[counts].min()) if counts.size else None
-    return Estimate(
+    estimate = Estimate(
         "J",
-        gain - bias,
+        here.gain - bias,
         float(np.sqrt(total)),
         variance=variance,
         visits=model.visits,
-        third=third,
-        freedom=max(freedom, 1.0),
+        freedom=1 / unsure if unsure > 0 else np.inf,
         bias=bias,
         untried=(0.0, untried),
-        smallest_visits=fewest,
-        withheld=withheld,
+        smallest_visits=int(model.visits.flat[counts].min()) if counts.size else None,
+        withheld=_same_reward(model, part) or _withheld(total, bias, untried),
     )
+    if estimate.withheld:  # a correction that cannot be trusted is none
+        return replace(estimate, value=here.gain, bias=0.0)
+
+    @lru_cache(maxsize=8)
+    def limits(budget: float) -> tuple[float, float]:
+        low, high = (_furthest(model, part, rows, here, sign, budget, policy, optimal) for sign in (-1.0, 1.0))
+        return low - max(bias, 0.0) - 2 * bias_error, high - min(bias, 0.0) + 2 * bias_error
+
+    estimate = replace(estimate, limits=limits)
+    if not np.isfinite(estimate.interval()).all():
+        return replace(estimate, value=here.gain, bias=0.0, withheld="models that fit the data fall into parts")
+    return estimate
+
+
+class _Worth(NamedTuple):
+    """Of a policy [n, A] in a problem."""
+
+    gain: float  # J
+    d: np.ndarray  # its stationary distribution over pairs, [n, A]
+    value: np.ndarray  # relative, [n]
+
+
+def _worth(problem: Problem, policy: np.ndarray) -> _Worth:
+    prior = np.where(policy > 0, problem.prior, 1.0)
+    lu = problem.regeneration(policy)
+    gain, value = lu.poisson((policy * problem.reward).sum(1) - kl_per_state(policy, prior) / problem.beta)
+    return _Worth(gain, lu.stationary()[:, None] * policy, value)
+
+
+def _optimum(problem: Problem, near: np.ndarray, tol: float) -> _Worth:
+    """Of the optimal policy, to ``tol`` in J: soft policy iteration from the value ``near`` [n]."""
+    last = -np.inf
+    for _ in range(MAX_STEPS):
+        found = _worth(problem, soft_backup(problem.action_value(near), problem.prior, problem.beta)[1])
+        if not found.gain > last + tol:
+            break
+        last, near = found.gain, found.value
+    return found
 
 
 class _Rows(NamedTuple):
@@ -270,9 +312,8 @@ class _Rows(NamedTuple):
     n: np.ndarray  # draws that stay inside the problem
     share: np.ndarray  # of each transition entry among them, [nnz]
     x: np.ndarray  # mean of x given s', less the row's mean, [nnz]
-    variance: np.ndarray  # divisor n - 1, with the successors that were never seen
-    third: np.ndarray  # central moments
-    fourth: np.ndarray
+    noise: np.ndarray  # variance of r given s', mean over s'
+    variance: np.ndarray  # of x; divisor n - 1, as that of noise
 
 
 def _rows(model: EmpiricalMDP, part: EmpiricalProblem, value: np.ndarray) -> _Rows:
@@ -284,93 +325,214 @@ def _rows(model: EmpiricalMDP, part: EmpiricalProblem, value: np.ndarray) -> _Ro
     n = model.visits.ravel() * total
     with np.errstate(invalid="ignore", divide="ignore"):
         share = np.where(kept > 0, kept / total[rows], 0.0)
-
-    def mean(entries: np.ndarray) -> np.ndarray:
-        return np.bincount(rows, share * entries, model.visits.size)
-
     x = model.reward_given_next + value[p.indices]
-    centre = mean(x)
-    x = x - centre[rows]
-    within = _within(model, share, rows)
-    between = mean(x**2)
+    x = x - np.bincount(rows, share * x, model.visits.size)[rows]
     unbiased = np.where(n > 1.5, n / np.maximum(n - 1, 1), 1.0)
-    # A successor that was never seen: the next draw brings one about as often as draws have had one of their own.
-    seen_once = np.bincount(rows, (np.rint(kept * model.visits.ravel()[rows]) == 1), model.visits.size)
-    new = seen_once / np.maximum(n, 1)  # Good and Turing
-    others = value[inside]
-    away = others.var() + (others.mean() - (centre - model.reward.ravel())) ** 2
-    variance = (between + within) * unbiased + new * away
-    known = part.used.ravel() & (n > 1.5)
+    noise = _within(model, share, rows) * unbiased
+    variance = np.bincount(rows, share * x**2, model.visits.size) * unbiased + noise
+    used = part.used.ravel()
+    once = used & ~(n > 1.5)
     # One draw shows no variance: it is given the largest of the others.
-    largest = variance[known].max(initial=0.0)
-    variance = np.where(known, variance, np.where(part.used.ravel(), np.maximum(largest, variance), 0.0))
-    third = mean(x**3)
-    fourth = mean(x**4) + 6 * between * within + 3 * within**2 + new * away**2
-    return _Rows(n.reshape(shape), share, x, *(m.reshape(shape) for m in (variance, third, fourth)))
+    for each in (noise, variance):
+        each[once] = each[used & ~once].max(initial=0.0)
+        each[~used] = 0.0
+    return _Rows(n.reshape(shape), share, x, noise.reshape(shape), variance.reshape(shape))
+
+
+def _furthest(
+    model: EmpiricalMDP,
+    part: EmpiricalProblem,
+    rows: _Rows,
+    here: _Worth,
+    sign: float,
+    budget: float,
+    policy: np.ndarray,
+    optimal: bool,
+) -> float:
+    """The largest (``sign`` 1) or smallest (-1) J that steps find among models whose log-likelihood is down by
+    ``budget`` at most; of the optimal policy or of ``policy`` [n, A]. Infinite where such a model has no J."""
+    problem = part.problem
+    p, given = _with_successor(model, part, rows, sign * here.value)
+    row = np.repeat(np.arange(problem.reward.size), np.diff(p.indptr))
+    n = np.where(part.used, np.maximum(rows.n, 1.0), np.inf)[problem.states].ravel()
+    noise = rows.noise[problem.states].ravel()
+    moved, cost = np.empty(p.nnz), np.empty(len(n))
+    now, best = here, here.gain
+    for _ in range(MAX_STEPS):
+        slope = sign * now.d.ravel() / n  # of J, along what one draw says
+        x = given + now.value[p.indices]
+        x = x - np.add.reduceat(p.data * x, p.indptr[:-1])[row]
+        unit = max(float((slope[row] * x).max()), float(np.abs(slope * np.sqrt(noise)).max()))
+        if not np.isfinite(unit):
+            return sign * np.inf
+        if unit <= 1e-30 * float(np.abs(slope).max()) * float(np.abs(x).max()):  # none but by rounding
+            return best
+        slope = slope / unit
+
+        def spent(log_price: float, slope: np.ndarray = slope, x: np.ndarray = x) -> float:
+            """Log of the likelihood spent at a price of it, over the budget; leaves the rows in ``moved``."""
+            at = slope * np.exp(-log_price)
+            kernels.likelihood_rows(p.indptr, p.data, x, at, moved, cost)
+            per_draw = cost + 0.5 * at**2 * noise
+            return float(np.log(np.maximum((n[per_draw > 0] * per_draw[per_draw > 0]).sum(), 1e-300) / budget))
+
+        log_price = _root(spent)
+        spent(log_price)
+        reward = np.add.reduceat(moved * given, p.indptr[:-1]) + slope * np.exp(-log_price) * noise
+        model_there = replace(
+            problem,
+            transition=sp.csr_array((moved.copy(), p.indices, p.indptr), shape=p.shape),
+            reward=problem.reward + reward.reshape(problem.reward.shape),
+        )
+        try:
+            if optimal:
+                now = _optimum(model_there, now.value, 0.1 * CLOSE * abs(best - here.gain))
+            else:
+                now = _worth(model_there, policy)
+        except SingularChainError:
+            return sign * np.inf
+        gained = sign * (now.gain - best)
+        if gained > 0:
+            best = now.gain
+        if not gained > CLOSE * abs(best - here.gain):
+            return best if np.isfinite(now.gain) else sign * np.inf
+    return best
+
+
+def _root(falling: Callable[[float], float]) -> float:
+    """Of a function that falls from above 0 to below, to about a thousandth; few steps where its slope is near -2.
+    -FAR if it is below 0 there."""
+    low = high = 0.0
+    step = 1.0
+    while falling(low) < 0:
+        if low == -FAR:
+            return low
+        high, low, step = low, max(low - step, -FAR), 2 * step
+    while falling(high) >= 0:
+        low, high, step = high, high + step, 2 * step
+    return float(optimize.brentq(falling, low, high, xtol=1e-3))
+
+
+def _with_successor(
+    model: EmpiricalMDP, part: EmpiricalProblem, rows: _Rows, worth: np.ndarray
+) -> tuple[sp.csr_array, np.ndarray]:
+    """(the problem's transitions, in every row with an entry of probability 0 for the successor of most ``worth`` [n]
+    that it may hide; mean reward of each entry less the row's, 0 where it was not seen).
+
+    A row may hide what another action leads to that shares its state and a successor with it; where it has a successor
+    of one draw alone, any state.
+    """
+    problem = part.problem
+    p, n_actions = problem.transition, problem.n_actions
+    n_rows = p.shape[0]
+    row = np.repeat(np.arange(n_rows), np.diff(p.indptr))
+    _, to, slot = problem.pattern
+    leads = sp.csr_array((np.ones(p.nnz), slot, p.indptr), shape=(n_rows, len(to)))  # row to (state, successor)
+    like = sp.csr_array((leads @ leads.T) @ leads)
+    like = sp.csr_array((worth[to[like.indices]] - worth.min(), like.indices, like.indptr), shape=like.shape)
+    best = np.maximum.reduceat(like.data, like.indptr[:-1])
+    place = np.flatnonzero(like.data == np.repeat(best, np.diff(like.indptr)))
+    hidden = to[like.indices[place[np.searchsorted(place, like.indptr[:-1])]]]
+    draws = p.data * rows.n[problem.states].ravel()[row]
+    hidden[np.bincount(row, np.abs(draws - 1) < 0.5, n_rows) > 0] = np.argmax(worth)
+    at = np.concatenate([row, np.arange(n_rows)]), np.concatenate([p.indices, hidden])
+    wide = sp.csr_array((np.concatenate([p.data, np.zeros(n_rows)]), at), shape=p.shape)
+    row = np.repeat(np.arange(n_rows), np.diff(wide.indptr))
+    seen = model.transition
+    of_entry = sp.csr_array((model.reward_given_next, seen.indices, seen.indptr), shape=seen.shape)
+    pair = problem.states[row // n_actions] * n_actions + row % n_actions
+    given = np.asarray(of_entry[pair, problem.states[wide.indices]]).ravel()
+    given = np.where(wide.data > 0, given - np.bincount(row, wide.data * given, n_rows)[row], 0.0)
+    return wide, given
 
 
 def _second_order(
-    model: EmpiricalMDP, part: EmpiricalProblem, policy: np.ndarray, rows: _Rows, value: np.ndarray, optimal: bool
-) -> float:
-    """By how much noise in rows moves J on average (docs/theory.md, 4); 0 beyond BIAS_STATES, where it is left out.
+    model: EmpiricalMDP, part: EmpiricalProblem, here: _Worth, policy: np.ndarray, rows: _Rows, optimal: bool
+) -> tuple[float, float]:
+    """(by how much noise in rows moves J on average, standard error of that); docs/theory.md, 4.
 
     With e(s,a) the error of the mean of r + V(s') and Z = (I - K + 1 d)^-1: dV = Z (sum_a pi e), and on average over d
 
         sum_a pi (dp dV) + (beta/2) Var_pi(e + p dV),        the second term if the policy moves along.
+
+    That is tr(M Z) + sum |H Z diag(source)^1/2|^2, column by column; of more than BIAS_STATES states, the mean over
+    random signs in place of columns (Hutchinson).
     """
     problem = part.problem
-    states, n_states, n_actions = problem.states, problem.n_states, problem.n_actions
-    if n_states > BIAS_STATES:
-        return 0.0
-    chain = problem.chain(policy)
-    d = problem.regeneration(policy).stationary()
-    try:
-        z = np.linalg.inv(np.eye(n_states) - chain.toarray() + d)
-    except np.linalg.LinAlgError as error:
-        raise SingularChainError("parts of the chain are all but closed") from error
-    noise = np.zeros((n_states, n_actions))
-    used = part.used[states]
-    known = used & (rows.n[states] > 1.5)  # what one draw leaves open is a rule's, and no measurement
-    noise[known] = (rows.variance / np.maximum(rows.n, 1))[states][known]
+    states, n, n_actions = problem.states, problem.n_states, problem.n_actions
+    lu, d = problem.regeneration(policy), here.d.sum(1)
+    draws = np.maximum(rows.n, 1.0)
+    known = part.used & (rows.n > 1.5)  # what one draw leaves open is a rule's, and no measurement
+    noise = np.where(known, rows.variance / draws, 0.0)[states]
     # dp of a row goes with its own e alone.
     p = model.transition
     pair = np.repeat(np.arange(model.visits.size), np.diff(p.indptr))
     place = np.full(model.n_states, -1)
-    place[states] = np.arange(n_states)
-    at, to = place[pair // n_actions], place[p.indices]
-    entry = rows.share > 0
-    moved = np.zeros(model.visits.size)
-    moved += np.bincount(pair[entry], (rows.share * rows.x)[entry] * z[to[entry], at[entry]], model.visits.size)
-    together = moved.reshape(model.visits.shape)[states] / np.maximum(rows.n, 1)[states]
-    found = float((d[:, None] * policy**2 * np.where(known, together, 0.0)).sum())
+    place[states] = np.arange(n)
+    weight = np.zeros(model.visits.shape)
+    weight[states] = d[:, None] * policy**2
+    entry = (rows.share > 0) & known.ravel()[pair]
+    together = (weight / draws).ravel()[pair[entry]] * (rows.share * rows.x)[entry]
+    at = place[pair[entry] // n_actions], place[p.indices[entry]]
+    matrix = sp.csr_array((together, at), shape=(n, n))
+    found = 0.0
+    source = (policy**2 * noise).sum(1)  # variance of sum_a pi e, state by state
     if optimal:
-        source = (policy**2 * noise).sum(1)  # variance of sum_a pi e, state by state
-        h = (problem.transition @ z).reshape(n_states, n_actions, n_states)
-        h = h - (policy[:, :, None] * h).sum(1, keepdims=True)
-        own = np.arange(n_states)
-        direct = (policy * (1 - policy) * noise).sum(1)  # Var_pi(e)
-        through = (policy * (h**2 @ source)).sum(1)  # Var_pi(p dV)
-        both = 2 * (policy**2 * noise * h[own, :, own]).sum(1)
-        found += 0.5 * problem.beta * float(d @ (direct + through + both))
-    return found
+        found = 0.5 * problem.beta * float((here.d * (1 - policy) * noise).sum())  # Var_pi(e)
+        both = problem.beta * d[:, None] * policy * (policy * noise - source[:, None])
+        choose = sp.csr_array((both.ravel(), np.arange(both.size), np.arange(0, both.size + 1, n_actions)))
+        matrix = matrix + choose @ problem.transition
+
+    def through(x: np.ndarray) -> np.ndarray:
+        """Z x."""
+        y = lu.poisson(x)[1]
+        return np.asarray(y + d @ (x - y))
+
+    exact = n <= BIAS_STATES
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], (SIGNS, n))
+    terms = []
+    for x in np.eye(n) if exact else signs:
+        term = float(x @ (matrix @ through(x)))
+        if optimal:
+            h = (problem.transition @ through(np.sqrt(source) * x)).reshape(n, n_actions)
+            h = h - (policy * h).sum(1, keepdims=True)
+            term += 0.5 * problem.beta * float((here.d * h**2).sum())  # Var_pi(p dV)
+        terms.append(term)
+    if exact:
+        return found + sum(terms), 0.0
+    return found + float(np.mean(terms)), float(np.std(terms, ddof=1) / np.sqrt(SIGNS))
 
 
-def _withheld(variance: float, third: float, bias: float, untried: float) -> str:
+def _withheld(variance: float, bias: float, untried: float) -> str:
     if not variance > 0:
         return "no pair shows any variance"
-    if third**2 > 0 and variance**3 / third**2 < FEWEST:
-        return f"it rests on about {variance**3 / third**2:.1f} events"
-    if bias**2 > variance:
+    if not np.isfinite(variance):
+        return "its variance is beyond double precision"
+    if not abs(bias) <= np.sqrt(variance):
         return "the second order is larger than the first"
-    if untried**2 > 4 * variance:
+    if untried > 2 * np.sqrt(variance):
         return "pairs never tried matter more than those that were"
     return ""
 
 
-def _untried(model: EmpiricalMDP, part: EmpiricalProblem, d: np.ndarray) -> float:
-    """What J may gain from pairs that were never visited, were they as good as those tried in their state."""
-    states = part.problem.states
-    return float(d[states].sum(1) @ -np.log(part.tried)) / part.problem.beta
+def _same_reward(model: EmpiricalMDP, part: EmpiricalProblem) -> str:
+    rewards = model.reward[part.used]
+    if np.ptp(rewards) == 0 and not model.reward_variance[part.used].any():
+        return "every reward seen is the same"
+    return ""
+
+
+def _untried(part: EmpiricalProblem, here: _Worth) -> float:
+    """What J may gain, to first order, from pairs that were never visited, were each to bring its state's best reward
+    and the best successor that was seen from there."""
+    problem = part.problem
+    ptr, to, _ = problem.pattern
+    rewards = problem.reward - np.log(part.tried)[:, None] / problem.beta
+    best = np.max(rewards, axis=1) + np.maximum.reduceat(here.value[to], ptr[:-1])
+    better = problem.beta * (best - here.value - here.gain)
+    with np.errstate(divide="ignore"):
+        gain = np.logaddexp(0.0, np.log1p(-part.tried) + better)
+    return float(here.d.sum(1) @ gain) / problem.beta
 
 
 def _within(model: EmpiricalMDP, weight: np.ndarray, rows: np.ndarray) -> np.ndarray:
