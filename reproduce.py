@@ -1,8 +1,9 @@
-"""Rebuild a figure or table of the paper: numbers as CSV and JSON, picture as PNG and SVG, published against ours.
+"""Rebuild a figure or table of the paper: numbers as CSV and JSON, picture as PNG and SVG.
 
 python reproduce.py artifact=figure_5                  a small version, in seconds to a minute
 python reproduce.py artifact=table_s1 scale=full       the whole of it
 python reproduce.py artifact=all scale=full            everything
+Ours stand beside what is printed in the paper, read off its pictures, or computed independently (no claim of it).
 Stopped or killed, the same command goes on where it was. Files: runs/reproduce/ARTIFACT-SCALE-seedSEED.
 """
 

@@ -3,6 +3,7 @@
     python benchmarks/bench_s1.py            all parts (about three minutes)
     python benchmarks/bench_s1.py kernels    u phase: compiled kernel, C++, NumPy-array code
     python benchmarks/bench_s1.py psi        psi phase: cost of an epoch against the number of tuples
+    python benchmarks/bench_s1.py notes      the pass that notes and the interval of theta need, against the learning
     python benchmarks/bench_s1.py commands   whole commands: the default run, --help
 
 CPU seconds of this process; medians of interleaved rounds. C++ needs g++ and is left out without it.
@@ -20,14 +21,17 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
-from erl_torch import AlgorithmS1, Transitions, collect, kernels
+from erl_torch import AlgorithmS1, CertaintyEquivalence, EfficientS1, Transitions, collect, kernels, reservations
 from erl_torch.envs.windy_cliff import WindyCliffEnv
 from erl_torch.learners import listing
 from erl_torch.learners.algorithm_s1 import S1Stream
+from erl_torch.recordings import ColumnWriter, open_recording
+from erl_torch.transitions import Recording
 
 ROOT = Path(__file__).parents[1]
 LR_U, LR_RHO, BETA = 0.005, 0.005 / 15, 10.0
@@ -149,6 +153,35 @@ def bench_psi() -> None:
         print(f"| {n:,} | {seconds['prepare'] * 1e3:.3g} | {epoch * 1e3:.3g} | {slow * 1e3:.4g} |")
 
 
+def bench_notes() -> None:
+    print("\n| stream | pass, ms | a tuple, ns | learner | learning, s | pass / learning |\n|---|---|---|---|---|---|")
+    env = WindyCliffEnv()
+    learners: dict[str, Any] = {"s1": AlgorithmS1(), "s1_efficient": EfficientS1()}
+    learners["certainty_equivalence"] = CertaintyEquivalence()
+    with tempfile.TemporaryDirectory() as directory:
+        held = collect(env, 500, 1000, 0)
+        with ColumnWriter(Path(directory) / "tuples") as writer:
+            writer.append(collect(env, 5000, 1000, 0))
+        streams: dict[str, Recording] = {
+            "500,000 tuples, simulated": held,
+            "5,000,000 tuples, recorded": open_recording(f"{directory}/tuples/", 15, 4),
+        }
+        for name, data in streams.items():
+            for which, learner in learners.items():
+                next_actions = learner.drawn_from_prior == "a_next"
+
+                def count(data: Recording = data, next_actions: bool = next_actions) -> None:
+                    reservations.count(data, 15, 4, next_actions)
+
+                def fit(data: Recording = data, learner: Any = learner) -> None:
+                    learner.fit(data, 15, 4)
+
+                seconds = medians({"pass": count, "fit": fit}, rounds=3)
+                each = f"{seconds['pass'] * 1e3:.3g} | {seconds['pass'] / len(data) * 1e9:.3g}"
+                ratio = seconds["pass"] / seconds["fit"]
+                print(f"| {name} | {each} | `{which}` | {seconds['fit']:.3g} | {ratio:.2g} |", flush=True)
+
+
 def bench_commands() -> None:
     print("\nwhole commands, wall seconds, median (min to max) of 7, compile cache warm\n")
     print("| command | seconds |\n|---|---|")
@@ -167,6 +200,6 @@ def bench_commands() -> None:
 
 if __name__ == "__main__":
     torch.set_num_threads(1)
-    parts = {"kernels": bench_kernels, "psi": bench_psi, "commands": bench_commands}
+    parts = {"kernels": bench_kernels, "psi": bench_psi, "notes": bench_notes, "commands": bench_commands}
     for part in sys.argv[1:] or parts:
         parts[part]()

@@ -1513,13 +1513,6 @@ MUTANTS = [
         "learner.fit(data",
         "test_comparison.py::test_every_learner_has_the_same_experience",
     ),
-    Mutant(
-        "resamples of a comparison differ from figure to figure",
-        "comparison.py",
-        "return np.random.default_rng(0)",
-        "return np.random.default_rng()",
-        "test_comparison.py::test_the_same_figures_have_the_same_interval",
-    ),
     # -- the log
     Mutant(
         "constants are not written beside records",

@@ -23,6 +23,7 @@ FROM, TO, PAGE = (
 )
 MOST_SVG = 300_000  # bytes
 SOURCES = ("printed", "picture", "stated")  # the paper's
+COLUMNS = ("printed", "read off", "computed")
 HEAD = """# The whole paper, one command each
 
     python reproduce.py artifact=NAME                 a small version
@@ -31,19 +32,22 @@ HEAD = """# The whole paper, one command each
 
 `NAME` is one of the artifacts below. Numbers come as CSV and JSON, the picture as PNG and SVG, in
 `runs/reproduce/NAME-SCALE-seedSEED`. A run that was stopped or killed goes on with the units of work that are missing.
-On one machine the same seed gives the same files, byte for byte, for any number of `processes` (a second run of
-Figures 1, 2, 4, 5, S1 and Table S1 gave the same 24 files; Figure 3 and Table S2 were not run twice); other processors
-and other versions of NumPy, SciPy and Matplotlib may round the last digits otherwise.
+The same seed gives the same files for any number of `processes`. On one machine a second run gave, byte for byte, the
+32 files of all figures and of Table S1, and of Table S2's 127 units of work the 112 that were done again: all of the
+three small tasks, and Acrobot as described. Its other fifteen, of half a minute to minutes each, were not. Other
+processors and other versions of NumPy, SciPy and Matplotlib may round the last digits otherwise.
 
 **Reproduced** means one thing. A number with no chance in it: equal to half a unit of the last digit given. A mean: the
 difference from ours is no more than 95 % of differences would be were both samples of one law, by its standard error,
 sqrt(e1^2 + e2^2 + d^2/3), where e1 and e2 are the standard errors of both means and d is half a unit of the last digit
-or the error of reading (Student's t; the 95 % are for all lines of a table together, by Sidak). A single count is a
-mean of one. *Allowed* is that largest difference. What the paper says in words is held against the same words, with the
-threshold named.
+or the error of reading (Student's t, as for normal means). The 95 % are for all lines with chance in them that stand in
+one column of a table, together (Sidak; the thirteenth line of Table S1, a binomial count, is one of them). A single
+count is a mean of one. *Allowed* is that largest difference. What the paper says in words is held against the same
+words, with the threshold named.
 
 Three columns tell where a value comes from: *printed* in the paper, *read off* one of its pictures, or *computed*
-independently of this package (by us, so no claim of the paper). "Met" counts the paper's alone.
+independently of this package (by us, so no claim of the paper: such a value *agrees* or *differs*, by the same rule).
+"Met" counts the paper's alone.
 
 """
 
@@ -60,14 +64,14 @@ def main() -> None:
     lines = ["| artifact | what | verdict | printed, met | read off, met | in words, met | computed, agree |"]
     lines.append("|---" * 7 + "|")
     for name, about in abouts.items():
-        met = (share(about["published_against_ours"], source) for source in (*SOURCES, "computed"))
+        met = (share(about["comparisons"], source) for source in (*SOURCES, "computed"))
         what = f"[{title(name)}](#{title(name).lower().replace(' ', '-')})"
         lines.append(f"| {what} | {about['title']} | {about['verdict']} | {' | '.join(met)} |")
     PAGE.write_text(HEAD + "\n".join(lines) + "\n" + "".join(section(name, about) for name, about in abouts.items()))
 
 
 def share(numbers: list[dict[str, Any]], source: str) -> str:
-    its = [number["verdict"] == "reproduced" for number in numbers if number["source"] == source]
+    its = [number["verdict"] in ("reproduced", "agrees") for number in numbers if number["source"] == source]
     return f"{sum(its)} of {len(its)}" if its else ""
 
 
@@ -86,18 +90,19 @@ def section(name: str, about: dict[str, Any]) -> str:
         f"![{title(name)}]({at}.png)\n",
         *(f"- {sentence}" for sentence in about["reading"]),
     ]
-    if about["published_against_ours"]:
+    if about["comparisons"]:
         lines += ["\n| | printed | read off | computed | ours | allowed | verdict | |", "|---" * 8 + "|"]
-    for number in about["published_against_ours"]:
-        column = {"printed": 0, "stated": 0, "picture": 1, "computed": 2}[number["source"]]
-        published = [cell(number["published"]) if i == column else "" for i in range(3)]
+    for number in about["comparisons"]:
+        given = (cell(number[column]) for column in COLUMNS)
         allowed = "" if number["within"] is None else f"{number['within']:.2g}"
-        cells = (number["quantity"], *published, cell(number["ours"]), allowed, number["verdict"], number["note"])
+        cells = (number["quantity"], *given, cell(number["ours"]), allowed, number["verdict"], number["note"])
         lines.append(f"| {' | '.join(cells)} |".replace("||", "&#124;&#124;"))
     return "\n".join(lines) + "\n"
 
 
 def cell(value: Any) -> str:
+    if value is None:
+        return ""
     if isinstance(value, list):
         return ", ".join(map(cell, value))
     return f"{value:.7g}" if isinstance(value, float) else str(value)

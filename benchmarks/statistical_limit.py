@@ -461,7 +461,7 @@ whose state says so. Phases replaced: share of phases at whose end V was taken f
     axes.set_ylabel("loss g* - J (reward a step)")
     axes.set_title(f"Windy cliff, beta 10, {n_seeds} streams")
     axes.grid(alpha=0.3)
-    axes.legend()
+    axes.legend(loc="lower left", fontsize=8)
     figure.savefig(ROOT / "docs" / "results" / "statistical_limit_online.png", dpi=130)
 
 

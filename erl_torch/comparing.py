@@ -100,6 +100,6 @@ def run_comparison(cfg: DictConfig, directory: Path, safe_point: Callable[[], No
     with contextlib.suppress(ValueError):
         directory = directory.resolve().relative_to(Path.cwd())
     print(f"\n{title}, {found.sizes[-1]:,} tuples each, theta* {found.theta:.7f}\n\n{found.table()}")
-    print("\ngap: mean over seeds, interquartile mean and its bootstrap interval; other columns: means")
+    print("\ngap: mean over seeds, interquartile mean and its interval (Student's t); other columns: means")
     print(f"tuples: streamed, all passes together\nrun directory  {directory}")
     return result

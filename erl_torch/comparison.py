@@ -37,7 +37,7 @@ from erl_torch.solution import Solution, Status
 from erl_torch.solvers import solve_soft_bellman
 
 MEASURES = ("gap", "kl", "kl_states", "theta_error", "n_steps", "seconds")
-RESAMPLES = 5000
+LEVEL = 0.95  # of the intervals
 FIRST_SIZE = 1000  # tuples, of a learning curve
 
 
@@ -65,8 +65,8 @@ class Comparison:
     def summary(self) -> dict[str, Any]:
         """Everything as JSON takes it; null for a figure that does not exist or is not finite.
 
-        ``table`` holds, a learner and measure of the whole stream: mean, iqm (interquartile mean over seeds) and the
-        bootstrap 95 % interval of the iqm; ``curves`` the iqm of the gap and its interval at every size.
+        ``table`` holds, a learner and measure of the whole stream: mean, iqm (interquartile mean over seeds) and
+        ``interval`` of the iqm (``iqm_interval``); ``curves`` the iqm of the gap and its interval at every size.
         """
         table = {
             name: {m: _statistics(self.measures[m][i, :, -1]) for m in MEASURES} for i, name in enumerate(self.learners)
@@ -286,22 +286,37 @@ def interquartile_mean(values: np.ndarray, axis: int = -1) -> Any:
     return scipy.stats.trim_mean(values, 0.25, axis=axis)
 
 
+def iqm_interval(values: np.ndarray) -> tuple[float, float] | None:
+    """95 % interval of the interquartile mean of [n] independent values >= 0; None of fewer than two.
+
+    Student's t with n - 2 floor(n/4) - 1 degrees of freedom and the winsorised deviation (Tukey and McLaughlin 1963),
+    cut at 0. Below four values nothing is left out: the interval of the plain mean. Of normal values it holds the truth
+    in .93 to .95 of cases for any n, of log-normal ones (deviation 1 of the logarithm) in .91 to .95; resampling, which
+    never leaves the range of the values, in .51 of cases for n = 2, .76 for n = 3.
+    """
+    n, left_out = len(values), len(values) // 4
+    used = n - 2 * left_out
+    if used < 2:
+        return None
+    unit = values.max() or 1.0  # squares of the values may leave the range of numbers
+    ordered = np.sort(values / unit)
+    winsorised = np.clip(ordered, ordered[left_out], ordered[n - left_out - 1])
+    error = unit * winsorised.std(ddof=1) * np.sqrt((n - 1) / (used * (used - 1)))
+    half = scipy.stats.t.isf((1 - LEVEL) / 2, used - 1) * error
+    middle = interquartile_mean(values)
+    return max(float(middle - half), 0.0), float(middle + half)
+
+
 def _statistics(values: np.ndarray) -> dict[str, Any]:
     """mean, iqm and interval of [seeds]; None where a value is not finite."""
     if not np.isfinite(values).all():
         return {"mean": None, "iqm": None, "interval": None}
-    interval = None
-    if len(values) > 1:
-        found = scipy.stats.bootstrap(
-            (values,), interquartile_mean, n_resamples=RESAMPLES, method="percentile", random_state=_generator()
-        ).confidence_interval
-        interval = [float(found.low), float(found.high)]
-    return {"mean": float(values.mean()), "iqm": float(interquartile_mean(values)), "interval": interval}
-
-
-def _generator() -> np.random.Generator:
-    """The same resamples for every figure: learners are compared on the same seeds."""
-    return np.random.default_rng(0)
+    interval = iqm_interval(values)
+    return {
+        "mean": float(values.mean()),
+        "iqm": float(interquartile_mean(values)),
+        "interval": None if interval is None else list(interval),
+    }
 
 
 def _nullable(values: Any) -> Any:

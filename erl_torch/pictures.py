@@ -140,7 +140,7 @@ def table_picture(table: np.ndarray, title: str, label: str, max_px: int = MAX_P
 def learning_curves(sizes: Sequence[int], curves: Mapping[str, Sequence[Mapping[str, Any]]], title: str) -> np.ndarray:
     """Gap against tuples of experience, log-log; ``curves`` as ``Comparison.summary`` has them.
 
-    Lines are interquartile means, bands their bootstrap intervals; names stand at the right ends.
+    Lines are interquartile means, bands their intervals; names stand at the right ends.
     """
     figure = Figure(figsize=(8.4, 5.0), dpi=150)
     axes = figure.add_axes((0.095, 0.115, 0.66, 0.77))
@@ -158,12 +158,13 @@ def learning_curves(sizes: Sequence[int], curves: Mapping[str, Sequence[Mapping[
         bands = [(n, *point["interval"]) for n, point in shown if point["interval"]]
         if bands:
             at, low, high = np.array(bands).T
-            axes.fill_between(at, np.maximum(low, 1e-300), high, color=colour, alpha=0.18, linewidth=0, zorder=2)
+            # An interval that reaches 0 has no lower end here: the axis keeps to the lines.
+            axes.fill_between(at, np.maximum(low, min(y) / 3), high, color=colour, alpha=0.18, linewidth=0, zorder=2)
         ends.append((y[-1], name, colour))
     _plain(axes, "tuples of experience", "gap  g* \u2212 J,  reward a step")
     axes.set_xlim(sizes[0] / 1.15 if len(sizes) > 1 else sizes[0] / 2, sizes[-1])
     figure.text(0.095, 0.945, title, fontsize=11, weight="bold")
-    figure.text(0.095, 0.908, "interquartile mean over seeds, bootstrap 95 % band", fontsize=8.5, color="#666666")
+    figure.text(0.095, 0.908, "interquartile mean over seeds, 95 % band", fontsize=8.5, color="#666666")
     _name_ends(axes, sorted(ends))
     return _pixels(figure)
 

@@ -24,7 +24,7 @@ report("old policy, motor intact", before, old.policy)
 report("old policy, motor broken", after, old.policy)
 report("new policy, motor broken", after, new.policy)
 print(f"\nbiasing iterations: {new.n_steps} from the old solution, {alone.n_steps} from nothing")
-print(f"new theta in [{new.theta_bounds[0]:.9f}, {new.theta_bounds[1]:.9f}]")
+print(f"new theta in {list(new.theta_bounds)}")
 
 tuples = erl_torch.collect(after, n_episodes=200, episode_length=1000, seed=0)
 learnt = erl_torch.EfficientS1(beta=BETA).fit(tuples, after.n_states, after.n_actions)

@@ -17,7 +17,7 @@ learnt = erl_torch.EfficientS1(beta=BETA).fit(tuples, 16, 4)
 warnings.simplefilter("ignore", erl_torch.MeanRewardWarning)  # its reward depends on s': the model has r(s,a)
 model = erl_torch.tabular_mdp(env, on_end="restart")  # its table P, episode after episode
 proven = erl_torch.certify(learnt, model, BETA)
-print(f"theta learnt {learnt.theta:.5f}, exact in [{proven.theta_bounds[0]:.5f}, {proven.theta_bounds[1]:.5f}]")
+print(f"theta learnt {learnt.theta:.5f}, exact in {list(proven.theta_bounds)}")
 
 rng = np.random.default_rng(0)
 uniform = np.full((16, 4), 0.25)

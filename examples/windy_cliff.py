@@ -15,7 +15,7 @@ for learner in (erl_torch.AlgorithmS1(beta=BETA), erl_torch.EfficientS1(beta=BET
     learnt = learner.fit(tuples, mdp.n_states, mdp.n_actions)
     proven = erl_torch.certify(learnt, mdp, BETA)  # needs the model, which the learner has not seen
     low, high = proven.theta_bounds
-    print(f"\n{type(learner).__name__}: theta {learnt.theta:.4f}, and the truth is in [{low:.6f}, {high:.6f}]")
+    print(f"\n{type(learner).__name__}: theta {learnt.theta:.4f}, and the truth is in [{low}, {high}]")
     print(f"  its objective is at most {proven.gap:.1e} a step below the best")
 
 print("\nthe policy, tile by tile (H cliff, G goal; # more than one action above 30%):")

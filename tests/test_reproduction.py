@@ -16,9 +16,13 @@ from hydra import compose, initialize_config_dir
 from erl_torch import InputError, config, estimate_mdp, iterate_biasing
 from erl_torch.reproduction import ARTIFACTS, SCALES, control, load, runner
 from erl_torch.reproduction.artifact import (
+    AGREES,
+    COLUMNS,
+    DIFFERS,
     NOT_REPRODUCED,
     NOTHING,
     ORACLE,
+    PICTURE,
     REPRODUCED,
     VERDICTS,
     Artifact,
@@ -112,35 +116,41 @@ def test_outputs_can_be_written_and_name_every_published_number(outputs, tmp_pat
         about = json.loads((tmp_path / f"{name}.json").read_text())
         assert about["verdict"] in VERDICTS
         assert about["command"] == f"python reproduce.py artifact={name} scale=quick seed=0"
-        assert bool(about["published_against_ours"]) == (name != "figure_s2")
+        assert bool(about["comparisons"]) == (name != "figure_s2")
         lines = (tmp_path / f"{name}.csv").read_text().splitlines()
         assert len(lines) == len(output.rows) + 1
         assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
         assert (tmp_path / f"{name}.svg").stat().st_size > 1000
         text = runner.summary(load(name), output)
-        assert all(c.quantity in text and c.verdict in VERDICTS for c in output.comparisons)
+        assert all(c.quantity in text and c.verdict in (*VERDICTS, AGREES, DIFFERS) for c in output.comparisons)
+        for c, row in zip(output.comparisons, about["comparisons"], strict=True):
+            given = {"printed": row["printed"], "read off": row["read off"], "computed": row["computed"]}
+            assert [name for name, value in given.items() if value is not None] == [COLUMNS[c.source]]
     wanted = {
         "figure_4": [-756.59, -1000.0, -946.76, -997.14, -947.14],
         "figure_5": [-1.29, -0.985, -0.957, -0.966, -0.966, -1.626, -0.956],
         "table_s2": [28, 38, 29, 58],
     }
     for name, numbers in wanted.items():
-        given = [c.published for c in outputs[name].comparisons]
+        given = [c.reference for c in outputs[name].comparisons]
         assert all(given.count(number) >= numbers.count(number) for number in numbers)
 
 
 def test_exact_numbers(outputs):
     """Everything that does not hang on a sample meets its oracle."""
     for name in ("figure_1", "figure_2", "figure_4"):
-        assert {c.verdict for c in outputs[name].comparisons} == {REPRODUCED}
+        assert {c.verdict for c in outputs[name].comparisons} <= {REPRODUCED, AGREES}
     exact = [c for c in outputs["figure_5"].comparisons if not c.note]
     assert len(exact) == 14
-    assert {c.verdict for c in exact} == {REPRODUCED}
+    assert {(c.source, c.verdict) for c in exact} == {(PICTURE, REPRODUCED), (ORACLE, AGREES)}
 
 
 def test_verdicts():
     assert compared("a", 1.0, 1.04, 0.05).verdict == REPRODUCED
     assert compared("a", 1.0, 1.06, 0.05).verdict == NOT_REPRODUCED
+    assert compared("a", 1.0, 1.04, 0.05, PICTURE).verdict == REPRODUCED
+    assert compared("a", 1.0, 1.04, 0.05, ORACLE).verdict == AGREES
+    assert compared("a", 1.0, np.nan, 0.05, ORACLE).verdict == DIFFERS
     lines = [compared("a", 1.0, 1.0, 0.0), compared("b", 1.0, 2.0, 0.0, ORACLE)]
     assert Output([], lines, None).verdict == REPRODUCED  # a computed value is no claim of the paper
     assert Output([], [*lines, compared("c", 1.0, 2.0, 0.0)], None).verdict == NOT_REPRODUCED
@@ -353,7 +363,9 @@ def test_command(tmp_path, capsys):
     assert isinstance(output.comparisons[0], Comparison)
     said = capsys.readouterr().out
     assert "-756.59" in said
-    assert said.count(REPRODUCED) == len(output.comparisons)
+    assert said.count(AGREES) == len(output.comparisons)
+    assert REPRODUCED not in said
+    assert said.splitlines()[2].split() == ["computed", "ours", "verdict"]  # nothing of it is the paper's
     assert said.count(NOTHING) == 1  # all were computed independently
     names = {p.name for p in (tmp_path / "figure_4-quick-seed0").iterdir()}
     assert names == {"units", *(f"figure_4.{kind}" for kind in ("csv", "json", "png", "svg"))}

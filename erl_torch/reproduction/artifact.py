@@ -1,4 +1,4 @@
-"""What an artifact of the paper is to the runner, and how its numbers are held against the published ones."""
+"""What an artifact of the paper is to the runner, and how its numbers are held against the paper's."""
 
 from __future__ import annotations
 
@@ -14,12 +14,14 @@ REPRODUCED = "reproduced"
 NOT_REPRODUCED = "not reproduced"
 NOTHING = "no number of the paper"
 VERDICTS = (NOTHING, REPRODUCED, NOT_REPRODUCED)
+AGREES, DIFFERS = "agrees", "differs"  # of what was computed: there is nothing of the paper to reproduce
 PRINTED = "printed"  # a number in the paper's text or tables
 PICTURE = "picture"  # read off a figure of the paper
 STATED = "stated"  # said in words
 ORACLE = "computed"  # not the paper's: computed independently of this package
-SOURCES = (PRINTED, PICTURE, STATED, ORACLE)
-LEVEL = 0.95  # that all lines held against one sample are called reproduced, if they are of the same law
+# source: the column that its values stand in, in print and in JSON
+COLUMNS = {PRINTED: "printed", STATED: "printed", PICTURE: "read off", ORACLE: "computed"}
+LEVEL = 0.95  # that all lines of one artifact and column are called reproduced, where both samples are of one law
 
 Units = dict[str, dict[str, Any]]  # name of a unit -> keyword arguments of ``work``, as JSON takes them
 Results = dict[str, dict[str, np.ndarray]]  # name of a unit -> what ``work`` returned, as arrays
@@ -29,12 +31,18 @@ class Comparison(NamedTuple):
     """One number beside ours."""
 
     quantity: str
-    published: Any  # number, text, or list of numbers
+    reference: Any  # number, text, or list of numbers
     ours: Any
-    verdict: str  # REPRODUCED or NOT_REPRODUCED
-    source: str = PRINTED  # of ``published``, one of SOURCES
+    verdict: str  # ``judged``
+    source: str = PRINTED  # of ``reference``, a key of COLUMNS
     within: float | None = None  # the largest difference that counts as none
     note: str = ""
+
+    def row(self) -> dict[str, Any]:
+        """As JSON takes it: ``reference`` in the column of its source, None in the other columns."""
+        columns = dict.fromkeys(COLUMNS.values()) | {COLUMNS[self.source]: self.reference}
+        rest = {name: value for name, value in self._asdict().items() if name not in ("quantity", "reference")}
+        return {"quantity": self.quantity, **columns, **rest}
 
 
 @dataclass(frozen=True)
@@ -43,7 +51,7 @@ class Output:
 
     Args:
         rows: lines of the CSV file, all with the keys of the first, in its order.
-        comparisons: every published number beside ours.
+        comparisons: every number of the paper, and every one computed independently, beside ours.
         figure: the picture; its title or caption names the settings.
         reading: which reading is taken where the sources disagree, a sentence each.
         data: more that the JSON file should hold, as JSON takes it (no NaN).
@@ -88,23 +96,34 @@ class Artifact:
     units_of: str | None = None
 
 
+def judged(holds: bool, source: str) -> str:
+    """The verdict of a comparison with a value of that source."""
+    words = (DIFFERS, AGREES) if source == ORACLE else (NOT_REPRODUCED, REPRODUCED)
+    return words[holds]
+
+
 def compared(
-    quantity: str, published: float, ours: float, within: float, source: str = PRINTED, note: str = ""
+    quantity: str, reference: float, ours: float, within: float, source: str = PRINTED, note: str = ""
 ) -> Comparison:
-    """Reproduced if ``ours`` is within ``within`` of ``published``.
+    """Reproduced, or agreeing, if ``ours`` is within ``within`` of ``reference``.
 
     For numbers without chance ``within`` is half a unit of the last digit given, or the error of reading.
     """
-    verdict = REPRODUCED if abs(ours - published) <= within else NOT_REPRODUCED
-    return Comparison(quantity, published, float(ours), verdict, source, float(within), note)
+    verdict = judged(bool(abs(ours - reference) <= within), source)
+    return Comparison(quantity, reference, float(ours), verdict, source, float(within), note)
+
+
+def alone(lines: int) -> float:
+    """The chance that one of ``lines`` independent lines may have of failing, if all are to hold with LEVEL."""
+    return 1 - float(LEVEL ** (1 / lines))
 
 
 def compared_means(
     quantity: str,
-    published: float,
+    reference: float,
     ours: float,
     error: float,
-    published_error: float,
+    reference_error: float,
     last_digit: float,
     lines: int,
     freedom: float = np.inf,
@@ -114,31 +133,32 @@ def compared_means(
     """A mean against a mean: reproduced if they differ by no more than LEVEL allows for the error of the difference.
 
     Args:
-        quantity, published, source, note: as in ``Comparison``.
+        quantity, reference, source, note: as in ``Comparison``.
         ours: our mean.
-        error, published_error: standard errors of both.
-        last_digit: half a unit of the last digit published, or the error of reading; taken as uniform.
-        lines: how many such numbers are held against our sample; the level is that of all together (Sidak).
+        error, reference_error: standard errors of both.
+        last_digit: half a unit of the last digit given, or the error of reading; taken as uniform.
+        lines: how many numbers of this artifact and column are subject to chance; the level is at least LEVEL for
+            all together (Sidak).
         freedom: degrees of freedom of the standard errors (Student's t).
     """
-    of_difference = float(np.sqrt(error**2 + published_error**2 + last_digit**2 / 3))
-    quantile = float(scipy.stats.t.isf((1 - LEVEL ** (1 / lines)) / 2, freedom))
-    ratio = abs(ours - published) / of_difference if of_difference else np.inf
+    of_difference = float(np.sqrt(error**2 + reference_error**2 + last_digit**2 / 3))
+    quantile = float(scipy.stats.t.isf(alone(lines) / 2, freedom))
+    ratio = abs(ours - reference) / of_difference if of_difference else np.inf
     apart = f"{ratio:.1f} standard errors of {of_difference:.2g} apart"
-    return compared(quantity, published, ours, quantile * of_difference, source, f"{apart}; {note}" if note else apart)
+    return compared(quantity, reference, ours, quantile * of_difference, source, f"{apart}; {note}" if note else apart)
 
 
 def compared_samples(
-    quantity: str, published: float, ours: np.ndarray, n_published: int, last_digit: float, lines: int,
+    quantity: str, reference: float, ours: np.ndarray, n_reference: int, last_digit: float, lines: int,
     source: str = PRINTED, note: str = "",
 ) -> Comparison:  # fmt: skip
-    """As ``compared_means``: a mean of ``n_published`` draws against our draws [n], whose deviation stands for both.
+    """As ``compared_means``: a mean of ``n_reference`` draws against our draws [n], whose deviation stands for both.
 
     One draw is a mean of one.
     """
     deviation = ours.std(ddof=1)
-    its = f"ours of {len(ours)} in [{ours.min():.4g}, {ours.max():.4g}], published taken as of {n_published}"
+    its = f"ours of {len(ours)} in [{ours.min():.4g}, {ours.max():.4g}], the other taken as of {n_reference}"
     return compared_means(
-        quantity, published, ours.mean(), deviation / np.sqrt(len(ours)), deviation / np.sqrt(n_published), last_digit,
+        quantity, reference, ours.mean(), deviation / np.sqrt(len(ours)), deviation / np.sqrt(n_reference), last_digit,
         lines, len(ours) - 1, source, f"{its}; {note}" if note else its,
     )  # fmt: skip

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from erl_torch.envs.control import control_task
 from erl_torch.pictures import COLOURS
-from erl_torch.reproduction.artifact import NOT_REPRODUCED, REPRODUCED, STATED, Artifact, Comparison, Output, Results
+from erl_torch.reproduction.artifact import PICTURE, Artifact, Comparison, Output, Results, judged
 from erl_torch.reproduction.control import EPISODE_LENGTH, EPISODES, TASKS, work
 from erl_torch.reproduction.table_s2 import published_units, samples
 
@@ -56,11 +56,10 @@ def assemble(results: Results, scale: str) -> Output:
             for j in k.tolist()
         )  # fmt: skip
         rises = scaled[-1] - scaled[0]
-        verdict = REPRODUCED if rises >= RISE else NOT_REPRODUCED
         note = f"moving average from {smooth[0]:.1f} to {smooth[-1]:.1f}"
         comparisons.append(
-            Comparison(f"{title}: normalised return rises", "from 0 to 1", f"from {scaled[0]:.2f} to {scaled[-1]:.2f}",
-                       verdict, STATED, note=note)
+            Comparison(f"{title}: normalised return", "rises", f"from {scaled[0]:.2f} to {scaled[-1]:.2f}",
+                       judged(bool(rises >= RISE), PICTURE), PICTURE, note=note)
         )  # fmt: skip
         axes = figure.add_axes((0.065 + 0.315 * (i % 2), 0.54 - 0.43 * (i // 2), 0.245, 0.29))
         low, high = np.quantile(returns, [0.25, 0.75], axis=1)

@@ -188,12 +188,12 @@ def _comparisons(results: Results, ends: np.ndarray, exact: dict[str, Any]) -> l
     found += [
         compared("prior policy", PUBLISHED_PRIOR, exact["prior"], 5e-4, PICTURE),
         compared("optimal policy", PUBLISHED_OPTIMAL, exact["optimal"], 5e-4, PICTURE),
-        compared("theta*", 1.0101363366, exact["theta"], 1e-9, ORACLE),
-        compared("optimal, 1000 steps", -0.9559251, exact["optimal"], 1e-7, ORACLE),
-        compared("optimal, stationary", -0.955595, exact["optimal_rate"], 1e-6, ORACLE),
-        compared("prior, 1000 steps", -1.6263453, exact["prior"], 1e-7, ORACLE),
-        compared("exact iteration 0, 1000 steps", -1.3221561, exact["iterations"][0], 1e-7, ORACLE),
-        compared("exact iteration 1, stationary", -0.94197, exact["iteration_rates"][1], 1e-5, ORACLE),
+        compared("theta*", 1.0101363366, exact["theta"], 5e-11, ORACLE),
+        compared("optimal, 1000 steps", -0.9559251, exact["optimal"], 5e-8, ORACLE),
+        compared("optimal, stationary", -0.955595, exact["optimal_rate"], 5e-7, ORACLE),
+        compared("prior, 1000 steps", -1.6263453, exact["prior"], 5e-8, ORACLE),
+        compared("exact iteration 0, 1000 steps", -1.3221561, exact["iterations"][0], 5e-8, ORACLE),
+        compared("exact iteration 1, stationary", -0.94197, exact["iteration_rates"][1], 5e-6, ORACLE),
     ]
     found += [
         compared(f"exact iteration {k}: error of V", wanted, ours, digit, ORACLE)
@@ -227,7 +227,7 @@ def _figure(results: Results, reward: np.ndarray, j: np.ndarray, exact: dict[str
         for k, (published, _) in enumerate(PUBLISHED):
             axes.plot(15.6, published, "<", color=COLOURS[k], markersize=6, clip_on=False)
         axes.set_ylabel("mean reward a step (1000 steps)", fontsize=9)
-    whole.set_title("reward; triangles at the right: published ends", fontsize=10)
+    whole.set_title("reward; triangles at the right: published ends, read off", fontsize=10)
     whole.set_ylim(-1.67, -0.9)
     whole.legend(fontsize=7.5, ncols=2, loc=(0.33, 0.15))
     near.set_title("the same, near the optimum", fontsize=10)
@@ -271,7 +271,7 @@ def _gaps(axes: Axes, results: Results, j: np.ndarray, best: float) -> None:
         axes.fill_between(passes, low, high, color=colour, alpha=0.15, linewidth=0)
         axes.plot(passes, np.median(loss, axis=0), color=colour, linewidth=1.6, label=name)
     limit = float(np.median([r["certainty_equivalence_gap"] for r in results.values()]))
-    axes.axhline(limit, color="#7b3294", linestyle="-.", linewidth=1, label="certainty equivalence: limit of the data")
+    axes.axhline(limit, color="#7b3294", linestyle="-.", linewidth=1, label="certainty equivalence")
     axes.set_yscale("log")
     axes.set_ylim(3e-6, 30)
     axes.set_xlim(1, j[0].size)

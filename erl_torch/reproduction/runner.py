@@ -3,7 +3,7 @@
 For every artifact the folder ``<artifact>-<scale>-seed<seed>`` holds
 
     units/NAME.npz    what ``work`` made of a unit, with the settings behind it
-    NAME.csv .json    the numbers; published against ours
+    NAME.csv .json    the numbers; those of others beside ours, each in the column of its source
     NAME.png .svg     the picture
 
 A unit's file is written under a temporary name and renamed, so that a run killed at any moment leaves whole units or
@@ -43,7 +43,7 @@ from erl_torch.checks import InputError
 from erl_torch.config import check_reproduction_keys
 from erl_torch.files import read_npz, write_bytes, write_json, write_npz
 from erl_torch.reproduction import ARTIFACTS, SCALES, load
-from erl_torch.reproduction.artifact import ORACLE, Artifact, Output
+from erl_torch.reproduction.artifact import COLUMNS, Artifact, Output
 
 DPI = 130
 FINGERPRINT = "fingerprint"
@@ -118,13 +118,16 @@ def run(
 
 
 def summary(its: Artifact, output: Output) -> str:
-    """Published, ours and verdict, a line each."""
-    cells = [("", "published", "ours", "verdict")]
-    for c in output.comparisons:
-        mark = f" (against what was {c.source} independently)" if c.source == ORACLE else ""
-        cells.append((c.quantity, _cell(c.published), _cell(c.ours), c.verdict + mark))
-    widths = [max(len(row[i]) for row in cells) for i in range(4)]
-    lines = [f"  {a:{widths[0]}}  {b:>{widths[1]}}  {c:>{widths[2]}}  {d}" for a, b, c, d in cells]
+    """A line a comparison: what is printed, read off or computed, ours, verdict; no column that is empty."""
+    used = {COLUMNS[c.source] for c in output.comparisons}
+    columns = [name for name in dict.fromkeys(COLUMNS.values()) if name in used]
+    names = ["quantity", *columns, "ours", "verdict"]
+    cells = [["", *names[1:]], *([_cell(c.row()[name]) for name in names] for c in output.comparisons)]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    lines = []
+    for quantity, *values, verdict in cells if used else []:
+        aligned = [f"{value:>{width}}" for value, width in zip(values, widths[1:-1], strict=True)]
+        lines.append("  ".join([f"  {quantity:{widths[0]}}", *aligned, verdict]))
     return "\n".join([f"{its.name}: {its.title}", *lines, f"  {output.verdict}"])
 
 
@@ -217,13 +220,15 @@ def _write(its: Artifact, output: Output, folder: Path, scale: str, seed: int) -
         "command": f"python reproduce.py artifact={its.name} scale={scale} seed={seed}",
         "verdict": output.verdict,
         "reading": list(output.reading),
-        "published_against_ours": [c._asdict() for c in output.comparisons],
+        "comparisons": [c.row() for c in output.comparisons],
         **output.data,
     }
     write_json(folder / f"{its.name}.json", about)
 
 
 def _cell(value: Any) -> str:
+    if value is None:
+        return ""
     if isinstance(value, (list, tuple)):
         return "[" + ", ".join(map(_cell, value)) + "]"
     return f"{value:.6g}" if isinstance(value, float) else str(value)
