@@ -33,9 +33,9 @@ HEAD = """# The whole paper, one command each
 `NAME` is one of the artifacts below. Numbers come as CSV and JSON, the picture as PNG and SVG, in
 `runs/reproduce/NAME-SCALE-seedSEED`. A run that was stopped or killed goes on with the units of work that are missing.
 The same seed gives the same files for any number of `processes`. On one machine a second run gave, byte for byte, the
-32 files of all figures and of Table S1, and of Table S2's 127 units of work the 112 that were done again: all of the
-three small tasks, and Acrobot as described. Its other fifteen, of half a minute to minutes each, were not. Other
-processors and other versions of NumPy, SciPy and Matplotlib may round the last digits otherwise.
+32 files of all figures and of Table S1, and of Table S2's 127 units of work the 115 that were done again: all of the
+three small tasks, and four samples of Acrobot as described. Its other twelve, minutes each, were not. Other processors
+and other versions of NumPy, SciPy and Matplotlib may round the last digits otherwise.
 
 **Reproduced** means one thing. A number with no chance in it: equal to half a unit of the last digit given. A mean: the
 difference from ours is no more than 95 % of differences would be were both samples of one law, by its standard error,

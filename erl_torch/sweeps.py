@@ -25,7 +25,7 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.plugins import Plugins
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.plugins.launcher import Launcher
-from omegaconf import DictConfig
+from omegaconf import DictConfig, flag_override, read_write
 
 from erl_torch.checks import InputError
 from erl_torch.files import alone, read_json, write_json
@@ -202,7 +202,13 @@ def patient_launchers() -> Iterator[list[Path]]:
     make = Plugins.instantiate_launcher
 
     def instantiate_launcher(self: Plugins, *, config: DictConfig, **more: Any) -> Launcher:
-        return _Patient(make(self, config=config, **more), Path(str(config.hydra.sweep.dir)), sweeps)
+        directory = str(config.hydra.sweep.dir)
+        # One directory for all jobs: its name may have a key in it that is swept over.
+        quoted = directory.replace("\\", "\\\\").replace("'", "\\'")
+        given = config.hydra.overrides.hydra
+        with read_write(given), flag_override(given, "struct", False):
+            given.append(f"hydra.sweep.dir='{quoted}'")
+        return _Patient(make(self, config=config, **more), Path(directory), sweeps)
 
     Plugins.instantiate_launcher = instantiate_launcher  # type: ignore[method-assign,assignment]
     try:

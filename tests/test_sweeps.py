@@ -80,6 +80,16 @@ def rows(sweep):
     return {row["overrides"][0].split("=")[1]: row for row in json.loads((sweep / "sweep.json").read_text())["jobs"]}
 
 
+@pytest.mark.parametrize("launcher", ["basic", "joblib"])
+def test_a_sweep_has_one_directory_whatever_its_name_is_made_of(tmp_path, toy, launcher):
+    process = toy("-m", "x=2,3", "hydra.sweep.dir=of-${x}", f"hydra/launcher={launcher}")
+    _, err = process.communicate(timeout=120)
+    assert process.returncode == 0, err
+    (sweep,) = (path for path in tmp_path.iterdir() if path.is_dir())
+    assert sweep.name == "of-1.0"
+    assert [row["status"] for row in rows(sweep).values()] == ["converged"] * 2
+
+
 def test_every_launcher_runs_all_jobs_and_lists_all_failures(tmp_path, toy):
     """... whatever becomes of a job; a process of its own may die, and the job is started once more."""
     ends = ["well", "bad_input", "bug", "last"]
