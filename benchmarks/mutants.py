@@ -1535,6 +1535,77 @@ MUTANTS = [
         "api_pb2.STATUS_SUCCESS",
         "test_board.py::test_failed_runs_are_marked",
     ),
+    # -- constants of the bounds, and what is done where digits are lost
+    Mutant(
+        "a lost eigenvector cannot come back",
+        "solvers/biasing.py",
+        " or moved or upper - lower",
+        " or upper - lower",
+        "test_solver_claims.py::test_a_lost_eigenvector_may_come_back_while_the_dynamics_change",
+    ),
+    Mutant(
+        "a coarse value is not polished",
+        "solvers/biasing.py",
+        "        value, bounds = polish(problem, value, bounds, tol)\n",
+        "        pass\n",
+        "test_solver_claims.py::test_where_an_eigenvector_is_too_coarse_the_value_is_polished",
+    ),
+    Mutant(
+        "the Judge trusts every elimination",
+        "evaluation.py",
+        "            if sound and np.isfinite(gains)",
+        "            if np.isfinite(gains)",
+        "test_rounding.py::test_the_judge_knows_rates_below_range",
+    ),
+    Mutant(
+        "entries that lost digits pass",
+        "kernels.py",
+        "sound = sound and (p[i, j] >= tiny or i == j)",
+        "sound = sound",
+        "test_rounding.py::test_digits_lost_in_the_elimination_are_known",
+    ),
+    Mutant(
+        "a quarter of a drift's error in the gains",
+        "kernels.py",
+        "error[a] = 10.0 * epsilon * size",
+        "error[a] = 2.5 * epsilon * size",
+        "test_rounding.py::test_rounding_of_a_drift_is_in_the_bounds",
+    ),
+    Mutant(
+        "a quarter of a drift's error in a policy's gains",
+        "kernels.py",
+        "policy[s, a] * (10.0 * epsilon * moved",
+        "policy[s, a] * (2.5 * epsilon * moved",
+        "test_rounding.py::test_rounding_of_a_drift_is_in_the_bounds",
+    ),
+    Mutant(
+        "a quarter of the logarithm's error",
+        "kernels.py",
+        "(2 * n + 20) * epsilon * abs(size)",
+        "(0.5 * n + 5) * epsilon * abs(size)",
+        "test_rounding.py::test_rounding_of_many_small_priors_is_in_the_bounds",
+    ),
+    Mutant(
+        "a quarter of the error of a sum of divergences",
+        "kernels.py",
+        "rounding = (n + 40) * epsilon * found",
+        "rounding = (0.25 * n + 10) * epsilon * found",
+        "test_rounding.py::test_rounding_of_a_sum_of_divergences_is_in_the_bounds",
+    ),
+    Mutant(
+        "a divergence's terms have no error",
+        "kernels.py",
+        " + 8.0 * epsilon * size + n",
+        " + n",
+        "test_rounding.py::test_rounding_of_a_divergence_where_its_terms_cancel_is_in_the_bounds",
+    ),
+    Mutant(
+        "a sum over actions has no error",
+        "kernels.py",
+        "error = 2.0 * error + (n_actions + 12) * epsilon * size",
+        "error = 2.0 * error",
+        "test_rounding.py::test_rounding_of_a_sum_over_actions_is_in_the_bounds",
+    ),
 ]
 
 

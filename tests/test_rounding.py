@@ -394,6 +394,27 @@ def test_digits_lost_below_the_range_of_numbers_are_known():
     assert not sound
 
 
+def test_digits_lost_in_the_elimination_are_known():
+    """0 reaches 1 by way of 2 alone, with 3e-159 and 7e-160: once 2 is out, an entry of six digits. 1 leaves with
+    1e-20, so that no share of what is left of the elimination is below range."""
+    chain = np.zeros((5, 5))
+    chain[0, 3], chain[3, 0], chain[2, 0], chain[1, 4], chain[4, 1] = np.ones(5)
+    chain[0, 2], chain[2, 1], chain[1, 0] = 3e-159, 7e-160, 1e-20
+    share, sound = kernels.gth(chain.copy())
+    assert abs(share[1] / float(rational_shares(chain)[1]) - 1) > 1e-9
+    assert not sound
+
+
+def test_the_judge_knows_rates_below_range():
+    """0 is left with 1e-310, 1 with 3e-310: no elimination in normal numbers; the rewards are 0 and 1."""
+    mdp = TabularMDP([[[1.0, 1e-310]], [[3e-310, 1.0]]], [[0.0], [1.0]])
+    one = np.ones((2, 1))
+    assert not kernels.gth(mdp.transition.toarray())[1]
+    found = objective(mdp.transition, mdp.reward, one, 1.0, one, mdp.start)
+    assert found.low <= 0.25 <= found.high
+    assert found.low <= Judge(mdp, one, 10).objective(one, 1.0) <= found.high
+
+
 def test_worth_of_random_chains_lies_between_its_bounds():
     """In fractions; a closed state that the start does not lead to, worth 100, plays no part."""
     rng = np.random.default_rng(6)
@@ -504,3 +525,74 @@ def test_divergences_below_range_are_in_the_bounds():
             x, w = mpf(policy[0, 0]), mpf(prior[0, 0])
             kl = (x * mp.log(x / w)) / (1 + x) + mp.log((1 + w) / (1 + x))
             assert mpf(low[0]) <= -kl / mpf(1e-100) <= mpf(high[0])
+
+
+# -- problems that come close to what the bounds have room for: a quarter of a constant would not do ----------------
+
+
+def test_rounding_of_a_drift_is_in_the_bounds():
+    """One way out, of probability 1 - 9u and so 1 once divided by its sum; r takes off the drift as it is computed, so
+    that the gain is the drift's rounding: 9u of the row, up to u each of difference and product."""
+    rng = np.random.default_rng(12)
+    one, p = np.ones((2, 1)), 1 - 9 * 2.0**-53
+    transition = sp.csr_array(np.array([[0.0, p], [0.0, 1.0]]))
+    for _ in range(1000):
+        value = rng.uniform(1, 2, 2) * np.array([-1, 1])
+        drift = p * (value[1] - value[0])
+        reward = np.array([[-drift], [0.0]])
+        gain = Fraction(float(value[1])) - Fraction(float(value[0])) - Fraction(float(drift))
+        found = gains(transition, reward, one, 1.0, value)
+        assert Fraction(float(found.low[0])) <= gain <= Fraction(float(found.high[0]))
+        low, high = policy_gains(transition, reward, one, 1.0, one, value)
+        assert Fraction(float(low[0])) <= gain <= Fraction(float(high[0]))
+
+
+def test_rounding_of_many_small_priors_is_in_the_bounds():
+    """500 priors of .51u beside .5: each rounds up in the sum of the prior, and, of exp(beta q) - 1 = -.98, down."""
+    n, small = 500, 0.51 * 2.0**-53
+    prior = np.concatenate([[0.5], np.full(n, small), [0.5 - n * small]])
+    reward = np.concatenate([[-1e3], np.full(n, np.log(0.02)), [0.0]])
+    found = gains(sp.csr_array(np.ones((n + 2, 1))), reward[None], prior[None], 1.0, np.zeros(1))
+    weights = [mpf(float(x)) for x in prior]
+    mean = sum(w * mp.exp(mpf(float(r))) for w, r in zip(weights, reward, strict=True)) / sum(weights)
+    assert mpf(found.low[0]) <= mp.log(mean) <= mpf(found.high[0])
+
+
+def test_rounding_of_a_sum_of_divergences_is_in_the_bounds():
+    """1000 actions of prior .49u that are never chosen: beside the first, of .5, the sum of the terms loses each."""
+    n, small = 1000, 0.49 * 2.0**-53
+    prior = np.concatenate([[0.5], np.full(n, small), [0.5 - n * small]])
+    policy = np.append(np.zeros(n + 1), 1.0)
+    transition = sp.csr_array(np.ones((n + 2, 1)))
+    low, high = policy_gains(transition, np.zeros((1, n + 2)), prior[None], 1.0, policy[None], np.zeros(1))
+    kl = mp.log(sum(mpf(float(x)) for x in prior) / mpf(float(prior[-1])))
+    assert mpf(low[0]) <= -kl <= mpf(high[0])
+
+
+def test_rounding_of_a_divergence_where_its_terms_cancel_is_in_the_bounds():
+    """Two actions, the second some 10% more likely than its prior of 1e-4: terms of 1e-5, a divergence of 1e-6."""
+    rng = np.random.default_rng(13)
+    transition = sp.csr_array(np.ones((2, 1)))
+    for _ in range(1000):
+        w = rng.uniform(1e-4, 2e-4)
+        x = w * rng.uniform(1.1, 1.2)
+        prior, policy = np.array([[1 - w, w]]), np.array([[1 - x, x]])
+        low, high = policy_gains(transition, np.zeros((1, 2)), prior, 1.0, policy, np.zeros(1))
+        pi, of_prior = [mpf(float(v)) for v in policy[0]], [mpf(float(v)) for v in prior[0]]
+        kl = sum(p / sum(pi) * mp.log(p / sum(pi) / (q / sum(of_prior))) for p, q in zip(pi, of_prior, strict=True))
+        assert mpf(low[0]) <= -kl <= mpf(high[0])
+
+
+def test_rounding_of_a_sum_over_actions_is_in_the_bounds():
+    """One state, the policy that of the prior, so KL = 0; two rewards whose mean is next to nothing."""
+    rng = np.random.default_rng(14)
+    transition = sp.csr_array(np.ones((2, 1)))
+    for _ in range(200):
+        w = rng.uniform(0.1, 0.9)
+        prior = np.array([[w, 1 - w]])
+        x = rng.uniform(1, 2)
+        reward = np.array([[x, -x * w / (1 - w)]])
+        low, high = policy_gains(transition, reward, prior, 1.0, prior, np.zeros(1))
+        weights, r = [Fraction(float(v)) for v in prior[0]], [Fraction(float(v)) for v in reward[0]]
+        mean = (weights[0] * r[0] + weights[1] * r[1]) / sum(weights)
+        assert Fraction(float(low[0])) <= mean <= Fraction(float(high[0]))

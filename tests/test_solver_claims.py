@@ -8,9 +8,11 @@ import oracle
 import pytest
 import torch
 from conftest import random_mdp, random_policy
+from many_digits import problem
 
 from erl_torch import InputError, Status, TabularMDP, certify, iterate_biasing, solve_biasing, solve_soft_bellman
 from erl_torch.solvers import soft_bellman
+from erl_torch.solvers.biasing import PATIENCE
 from erl_torch.solvers.compiled import NewtonPattern
 from erl_torch.solvers.problem import Problem
 from erl_torch.solvers.result import exact_solution
@@ -148,18 +150,45 @@ def test_at_the_first_iteration_with_small_kl_the_bounds_say_whether_it_has_conv
 
 
 def test_an_eigenvector_beyond_doubles_ends_the_iteration():
-    """At beta 3.8 and a penalty of 1e9 two parts are joined by exp(-4e9): it took 200 iterations of a second each."""
-    t = np.array([[[1.0, 0.0], [0.0, 1.0]], [[0.0, 1.0], [1.0, 0.0]]])
-    t[0, 1], t[1, 1] = [1.0, 0.0], [0.0, 1.0]
-    t[0, 1] = [1 - 1e-12, 1e-12]
-    t[1, 1] = [1e-12, 1 - 1e-12]
+    """Two states that are left with weight 1e-12 exp(-4e9): Newton's chain falls apart, and every iteration adds no
+    more than a power step does. The first gives the bounds, PATIENCE others nothing."""
+    t = np.zeros((2, 2, 2))
+    t[:, 0] = np.eye(2)
+    t[:, 1] = [[1 - 1e-12, 1e-12], [1e-12, 1 - 1e-12]]
     mdp = TabularMDP(t, [[0.3, -1e9], [0.2, -1e9]])
     states = list(iterate_biasing(mdp, 4.0))
-    assert len(states) < 30
+    assert all(state.status is not Status.CONVERGED for state in states)
+    assert len(states) == 1 + PATIENCE
     # Apart, the states earn .3 - log(2)/4 and .2 - log(2)/4; leaving never pays.
     assert states[-1].theta_bounds[0] <= -(0.3 - np.log(2) / 4) <= states[-1].theta_bounds[1]
     found = solve_biasing(mdp, 4.0)
-    assert found.n_steps < 30
+    assert found.status is Status.STAGNATED
+    assert found.n_steps == len(states)
+
+
+@pytest.mark.filterwarnings("ignore::erl_torch.notes.Note")
+def test_a_lost_eigenvector_may_come_back_while_the_dynamics_change():
+    """Nine states, three actions: no eigenvector in the first seven iterations, whose bounds are those of the first."""
+    given = problem(4, 493)
+    mdp = TabularMDP(given.transition, given.reward, given.start)
+    states = list(iterate_biasing(mdp, given.beta, given.prior, max_steps=1 + PATIENCE))
+    assert all(state.status is not Status.CONVERGED for state in states)
+    found = solve_biasing(mdp, given.beta, given.prior)
+    assert found.status is Status.CONVERGED
+    assert found.theta == pytest.approx(solve_soft_bellman(mdp, given.beta, given.prior).theta, abs=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_where_an_eigenvector_is_too_coarse_the_value_is_polished(seed):
+    """At beta 1e-8 a rounding of log(y) is one of 1e-8 in V = log(y)/beta: Newton steps on V itself take that off."""
+    mdp, beta = random_mdp(np.random.default_rng(seed), 3, 2), 1e-8
+    *_, last = iterate_biasing(mdp, beta)
+    found = solve_biasing(mdp, beta)
+    assert last.theta_bounds[1] - last.theta_bounds[0] > 1e-9
+    assert found.status is Status.CONVERGED
+    # As beta vanishes the prior is optimal; r varies by a few units.
+    share = oracle.stationary(dense(mdp).mean(1))
+    assert found.theta == pytest.approx(-share @ mdp.reward.mean(1), abs=1e-6)
 
 
 def test_a_gap_is_not_below_the_loss_where_the_difference_rounds_down():

@@ -39,7 +39,7 @@ from erl_torch.solvers.soft_bellman import polish
 KL_TOLERANCE = 1e-6
 RTOL = 1e-13  # spread of the bounds on an eigenvalue
 MAX_NEWTON_STEPS = 60
-PATIENCE = 5  # iterations without an eigenvector in which the bounds do not halve
+PATIENCE = 5  # iterations without an eigenvector in which KL stays the same and the bounds do not halve
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +148,7 @@ def _iterate(problem: Problem, ref: int, known: Problem | None, max_steps: int) 
     value = np.zeros(problem.n_states)
     lower, upper = -np.inf, np.inf
     shift_before = width = np.inf
-    lost = 0
+    lost, kl_before = 0, np.full(problem.reward.size, np.inf)
     for k in range(max_steps):
         at, its_pattern = (known or problem, known_pattern) if k == 0 else (problem, pattern)
         h, bounds, status, newton_steps = _eigenvector(at, value, its_pattern, ref)
@@ -183,10 +183,12 @@ def _iterate(problem: Problem, ref: int, known: Problem | None, max_steps: int) 
         if shift <= 1e-13 * (1 + np.abs(beta * value).max()) and shift >= 0.5 * shift_before:
             return
         shift_before = shift
-        # Where the eigenvector is beyond double precision, the value runs away and proves nothing more.
+        # No eigenvector, and dynamics that no longer change: the value runs away, by the same step each time.
         lost += 1
-        if status is Status.CONVERGED or upper - lower < 0.5 * width:
+        moved = not np.allclose(kl, kl_before, rtol=KL_TOLERANCE, atol=KL_TOLERANCE)
+        if status is Status.CONVERGED or moved or upper - lower < 0.5 * width:
             lost, width = 0, upper - lower
+        kl_before = kl
         if lost == PATIENCE:
             return
 
