@@ -838,7 +838,7 @@ def _summary(
         lines.append(f"{'proven':18}{proven(result['theta_bounds'], result['gap'])}")
     if result["data"]:
         fewest, away = result["data_smallest_visits"], result["data_half_widths"]
-        rests = "" if fewest is None else f" (95%; {fewest} visits or more of each pair that counts)"
+        rests = "" if fewest is None else f" (95%; {fewest} visit{'s' * (fewest > 1)} or more of each pair that counts)"
         rests += f"; learnt: {away:.3g} half widths off" if away is not None and away > 1 else ""
         lines.append(f"{'the data say':18}{result['data']}{rests}")
     if result["n_experience"]:

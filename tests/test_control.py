@@ -486,7 +486,7 @@ def test_cyclic_reward_of_the_environments():
     [
         (lambda: estimate_mdp("cartpole"), "task=cartpole: must be pendulum or mountain_car or cart_pole or acrobot"),
         (lambda: estimate_mdp("pendulum", [4, 4, 4]), r"bins=\[4, 4, 4\]: must be a whole number or 2 of them"),
-        (lambda: estimate_mdp("pendulum", 4, low=[0.0]), "bins, low, high"),
+        (lambda: estimate_mdp("pendulum", 4, low=[0.0]), r"low=array of shape \(1,\): must be of shape \[2\]"),
         (lambda: estimate_mdp("pendulum", 0), r"bins\[0\]=0"),
         (lambda: estimate_mdp("pendulum", actions=[3.0]), "actions=.* finite numbers of at most 2 in size"),
         (lambda: estimate_mdp("acrobot", actions=[np.inf]), "actions=.* finite numbers"),

@@ -512,7 +512,7 @@ def test_a_failed_replica_ends_the_run_with_a_line_after_all_is_written(tmp_path
         (["++vary.betta=[1,2]"], r"vary.betta=\[1, 2\]: must be left out: the settings of the learner are beta"),
         (["++vary.beta=[1,x]"], "vary.beta=.*must be a list of numbers"),
         (["++vary.beta=[]"], "vary.beta=.*must be a list of numbers"),
-        (["++vary.beta=[1,-2]"], "vary.beta=-2: must be a finite number > 0"),
+        (["++vary.beta=[1,-2]"], "vary.beta=-2.0: must be a finite number > 0"),
         (["n_replicas=2", "learner=exact"], "learner=exact: must be one that learns"),
         (["n_replicas=2", "experience.save_to=x.npz"], "experience.save_to=x.npz: must be null"),
         (["n_replicas=2", "threads=0"], "threads=0"),

@@ -248,7 +248,10 @@ def test_rows_of_single_precision_are_welcome_and_named():
     rng = np.random.default_rng(5)
     p = rng.dirichlet(np.ones(5), (5, 3)).astype(np.float32)
     start = p[0, 0]
-    with pytest.warns(Note, match="rows of transition did not sum to 1, by up to"):
+    with (
+        pytest.warns(Note, match="rows of transition did not sum to 1, by up to"),
+        pytest.warns(Note, match="start did not sum to 1, by up to"),
+    ):
         mdp = TabularMDP(p, np.zeros((5, 3)), start)
     np.testing.assert_allclose(mdp.transition.sum(axis=1), 1, atol=4e-16)
     np.testing.assert_allclose(mdp.transition.toarray().reshape(5, 3, 5), p.astype(float), rtol=3e-7)
