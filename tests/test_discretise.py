@@ -57,7 +57,8 @@ def test_corners_enclose_the_cell(problem):
 
 
 def test_whole_numbers_of_any_type():
-    assert UniformBins((np.int32(2), np.uint8(3)), (0.0, 0.0), (1.0, 1.0)) == UniformBins((2, 3), (0.0, 0.0), (1.0, 1.0))
+    bins, low, high = (2, 3), (0.0, 0.0), (1.0, 1.0)
+    assert UniformBins((np.int32(2), np.uint8(3)), low, high) == UniformBins(bins, low, high)
 
 
 def test_little_endian_and_end_bins():
