@@ -1606,6 +1606,20 @@ MUTANTS = [
         "error = 2.0 * error",
         "test_rounding.py::test_rounding_of_a_sum_over_actions_is_in_the_bounds",
     ),
+    Mutant(
+        "the luck of the best action is no matter",
+        "uncertainty.py",
+        " - 2 * bias_error - luck, high",
+        " - 2 * bias_error, high",
+        "test_uncertainty.py::test_interval_covers_where_the_best_is_the_luckiest",
+    ),
+    Mutant(
+        "rows hide no reset",
+        "uncertainty.py",
+        "np.where(worth[reset] > worth[hidden], reset, hidden)",
+        "hidden",
+        "test_uncertainty.py::test_interval_covers_where_a_slip_may_be_unseen",
+    ),
 ]
 
 

@@ -270,6 +270,44 @@ def moves() -> TabularMDP:
     return TabularMDP(p, rng.normal(size=(8, 3)), np.eye(8)[0])
 
 
+def rooms() -> TabularMDP:
+    """Four rooms of three states, drawn; action 1 leads on to the next room with chance .1, and one room pays more."""
+    rng = np.random.default_rng(11)
+    p = np.zeros((12, 2, 12))
+    for s in range(12):
+        room = 3 * (s // 3)
+        p[s, :, room : room + 3] = rng.dirichlet(np.ones(3), 2)
+        p[s, 1] *= 0.9
+        p[s, 1, (room + 3) % 12] += 0.1
+    r = 0.3 * rng.normal(size=(12, 2))
+    r[9:] += 0.5
+    return TabularMDP(p, r)
+
+
+def arms() -> TabularMDP:
+    """One state, ten actions that pay nothing."""
+    return TabularMDP(np.ones((1, 10, 1)), np.zeros((1, 10)))
+
+
+def slips() -> TabularMDP:
+    """10 states in a row, the last pays 3; actions step right (from the end to the start) or left, and any step slips
+    to the start with chance .02."""
+    p, r = np.zeros((10, 2, 10)), np.full((10, 2), -0.1)
+    for s in range(10):
+        for a, to in enumerate(((s + 1) % 10, max(s - 1, 0))):
+            p[s, a, to] += 0.98
+            p[s, a, 0] += 0.02
+    r[9] = 3.0
+    return TabularMDP(p, r, np.eye(10)[0])
+
+
+def ties() -> TabularMDP:
+    """5 states; three actions lead on alike, and pay some thousandths more or less."""
+    rng = np.random.default_rng(10)
+    p = np.repeat(rng.dirichlet(np.ones(5), (5, 1)), 3, axis=1)
+    return TabularMDP(p, rng.normal(size=(5, 1)) + 0.003 * rng.normal(size=(5, 3)))
+
+
 class Case(NamedTuple):
     """A problem of the coverage page. ``noise``: draws of it are added to every reward."""
 
@@ -309,6 +347,9 @@ SETTLED = (  # on which the rules of the interval were settled
     Case("corridor of 8", corridor(8), 5.0, 1, 2000),
     Case("corridor of 8", corridor(8), 5.0, 1, 8000),
     Case("corridor of 8", corridor(8), 0.5, 1, 2000),
+    Case("a row of 10 with slips", slips(), 2.0, 1, 4000),
+    Case("three actions thousandths apart", ties(), 200.0, 1, 5000),
+    Case("two actions a thousandth apart", alike(), 100.0, 1, 500),
 )
 FRESH = (
     Case("ring of 20 with a pit", ring(), 1.0, 1, 4000),
@@ -317,7 +358,8 @@ FRESH = (
     Case("10 states x 3, rewards exponential", drawn(4, 10, 3, 0.3, 1.0), 1.0, 1, 2000, _centred_exponential),
     Case("50 states x 2, rows Dirichlet(.1)", drawn(5, 50, 2, 0.1, 1.0), 10.0, 1, 20_000),
     Case("50 states x 4, ten visits a pair", drawn(6, 50, 4, 0.1, 1.0), 3.0, 1, 2000),
-    Case("two actions a thousandth apart", alike(), 100.0, 1, 500),
+    Case("four rooms of 3", rooms(), 3.0, 1, 4000),
+    Case("ten equal arms, noisy rewards", arms(), 1000.0, 1, 1000, _normal(1.0)),
     Case("5 states x 3, all but the prior", drawn(7, 5, 3, 0.5, 5.0), 0.01, 1, 1000),
     Case("8 states x 3, half the optimum", drawn(9, 8, 3, 0.3, 1.0), 100.0, 1, 2000, None, _half_optimal),
     Case("deterministic moves, noisy rewards", moves(), 5.0, 1, 1000, _normal(1.0)),

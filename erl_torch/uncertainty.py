@@ -16,15 +16,18 @@ The interval is that of the likelihood (Owen's, with a successor that was never 
     sum_{s,a} n(s,a) (sum_s' p log(p/q) + dr^2 / (2 Var(r | s,a,s'))) <= t^2 / 2,
 
 p the frequencies, q the model's rows, dr what its mean reward is off beyond what q makes of it. A row may also lead
-where another action leads that shares its state and a successor with it, or, where a successor has one draw alone,
-anywhere: n draws may hide an event of chance 1 - exp(-t^2/2n). Few events make the interval wide and lopsided; where
-much was seen it is value -+ t se. Each end is found by steps: to the models worst to first order, J there, and on.
+where another action leads that shares its state and a successor with it, or where half of the states lead, or, where
+a successor has one draw alone, anywhere: n draws may hide an event of chance 1 - exp(-t^2/2n). Few events make the
+interval wide and lopsided; where much was seen it is value -+ t se. Each end is found by steps: to the models worst
+to first order, J there, and on.
 
 What is assumed: the draws of a pair are independent and alike, noise in the reward of one (s,a,s') is about normal in
 its mean, and what was seen nowhere (a state, a penalty) is not there. Then
 
     second order  noise in the rows moves J on average (the optimum of a model with errors picks among its errors and
                   looks better than it is): derived in docs/theory.md, 4, and taken off
+    luck          where actions' values differ by less than their noise and 1/beta is small beside it, the optimum
+                  takes the luckier one: the mean of its luck widens one side
     never tried   pairs widen one side, were they to bring the best that was seen from their state
 
 ``smallest_visits`` is the fewest draws of a pair behind at least 1% of the variance; ``withheld`` says why there is no
@@ -65,8 +68,11 @@ SIGNS = 100
 LOPSIDED = 0.1  # the middle's distance from the value, in half widths
 HALF = 0.5  # of the plug-in's standard error, that of resamples at least
 MAX_STEPS = 50
+PATIENCE = 10  # steps that gain nothing, where J has kinks
 FAR = 100.0  # logarithm of the price at which likelihood is given away
 CLOSE = 0.01  # part of the half width by which an end of the interval may fall short
+TIED = 2.0  # standard errors between two actions' values, up to which either may be the better
+COMMON = 0.5  # share of the states from which a successor is met anywhere
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,6 +259,7 @@ def _plug_in(model: EmpiricalMDP, part: EmpiricalProblem, policy: np.ndarray, op
         # Welch and Satterthwaite.
         unsure = float(((variance / total) ** 2 / np.maximum(rows.n - 1, 1)).sum()) if total > 0 else 0.0
     untried = _untried(part, here) if optimal else 0.0
+    luck = _luck(part, here, rows, policy) if optimal else 0.0
     counts = np.flatnonzero(variance > COUNTS * total)
     estimate = Estimate(
         "J",
@@ -271,8 +278,11 @@ def _plug_in(model: EmpiricalMDP, part: EmpiricalProblem, policy: np.ndarray, op
 
     @lru_cache(maxsize=8)
     def limits(budget: float) -> tuple[float, float]:
-        low, high = (_furthest(model, part, rows, here, sign, budget, policy, optimal) for sign in (-1.0, 1.0))
-        return low - max(bias, 0.0) - 2 * bias_error, high - min(bias, 0.0) + 2 * bias_error
+        if budget == 0:  # a level too small to tell from 0
+            return here.gain - bias, here.gain - bias
+        low = _furthest(model, part, rows, here, -1.0, budget, policy, optimal, luck > 0)
+        high = _furthest(model, part, rows, here, 1.0, budget, policy, optimal, False)
+        return low - max(bias, 0.0) - 2 * bias_error - luck, high - min(bias, 0.0) + 2 * bias_error
 
     estimate = replace(estimate, limits=limits)
     if not np.isfinite(estimate.interval()).all():
@@ -348,9 +358,14 @@ def _furthest(
     budget: float,
     policy: np.ndarray,
     optimal: bool,
+    tied: bool,
 ) -> float:
     """The largest (``sign`` 1) or smallest (-1) J that steps find among models whose log-likelihood is down by
-    ``budget`` at most; of the optimal policy or of ``policy`` [n, A]. Infinite where such a model has no J."""
+    ``budget`` at most; of the optimal policy or of ``policy`` [n, A]. Infinite where such a model has no J.
+
+    ``tied``: J has kinks, from one best action to another, and a step against one of them helps the other: where steps
+    gain no more they go against the mean of all policies met so far (fictitious play).
+    """
     problem = part.problem
     p, given = _with_successor(model, part, rows, sign * here.value)
     row = np.repeat(np.arange(problem.reward.size), np.diff(p.indptr))
@@ -358,10 +373,17 @@ def _furthest(
     noise = rows.noise[problem.states].ravel()
     moved, cost = np.empty(p.nnz), np.empty(len(n))
     now, best = here, here.gain
+    weights, weighed, steps, idle = np.zeros(len(n)), np.zeros(p.nnz), 0, 0
     for _ in range(MAX_STEPS):
-        slope = sign * now.d.ravel() / n  # of J, along what one draw says
+        d = now.d.ravel()
         x = given + now.value[p.indices]
         x = x - np.add.reduceat(p.data * x, p.indptr[:-1])[row]
+        if tied:
+            steps, weights, weighed = steps + 1, weights + d, weighed + d[row] * x
+        if idle:
+            d = weights / steps
+            x = np.divide(weighed, weights[row], out=x, where=weights[row] > 0)
+        slope = sign * d / n  # of J, along what one draw says
         unit = max(float((slope[row] * x).max()), float(np.abs(slope * np.sqrt(noise)).max()))
         if not np.isfinite(unit):
             return sign * np.inf
@@ -395,7 +417,11 @@ def _furthest(
         if gained > 0:
             best = now.gain
         if not gained > CLOSE * abs(best - here.gain):
-            return best if np.isfinite(now.gain) else sign * np.inf
+            idle += 1
+            if not np.isfinite(now.gain):
+                return sign * np.inf
+            if not tied or idle == PATIENCE:
+                return best
     return best
 
 
@@ -419,8 +445,8 @@ def _with_successor(
     """(the problem's transitions, in every row with an entry of probability 0 for the successor of most ``worth`` [n]
     that it may hide; mean reward of each entry less the row's, 0 where it was not seen).
 
-    A row may hide what another action leads to that shares its state and a successor with it; where it has a successor
-    of one draw alone, any state.
+    A row may hide what another action leads to that shares its state and a successor with it, and what is met from half
+    of the states (a reset, a slip); where it has a successor of one draw alone, any state.
     """
     problem = part.problem
     p, n_actions = problem.transition, problem.n_actions
@@ -433,6 +459,11 @@ def _with_successor(
     best = np.maximum.reduceat(like.data, like.indptr[:-1])
     place = np.flatnonzero(like.data == np.repeat(best, np.diff(like.indptr)))
     hidden = to[like.indices[place[np.searchsorted(place, like.indptr[:-1])]]]
+    met = np.unique(np.stack([p.indices[p.data > 0], row[p.data > 0] // n_actions]), axis=1)[0]
+    common = np.flatnonzero(np.bincount(met, minlength=problem.n_states) >= COMMON * problem.n_states)
+    if common.size:
+        reset = common[np.argmax(worth[common])]
+        hidden = np.where(worth[reset] > worth[hidden], reset, hidden)
     draws = p.data * rows.n[problem.states].ravel()[row]
     hidden[np.bincount(row, np.abs(draws - 1) < 0.5, n_rows) > 0] = np.argmax(worth)
     at = np.concatenate([row, np.arange(n_rows)]), np.concatenate([p.indices, hidden])
@@ -501,6 +532,29 @@ def _second_order(
     if exact:
         return found + sum(terms), 0.0
     return found + float(np.mean(terms)), float(np.std(terms, ddof=1) / np.sqrt(SIGNS))
+
+
+def _luck(part: EmpiricalProblem, here: _Worth, rows: _Rows, policy: np.ndarray) -> float:
+    """By how much J may be too large, beyond the second order, where actions' values differ by less than their noise.
+
+    The optimum takes the luckier of actions that may be as good as each other: it gains (1/beta) log mean exp(beta e)
+    on average, e the errors of their values. The second order has (beta/2) Var_pi(e) of that, of a policy that has made
+    its choice already, which is too little where beta e is not small.
+    """
+    problem, n = part.problem, np.maximum(rows.n, 1.0)
+    noise = np.where(part.used, rows.variance / n, 0.0)[problem.states]
+    with np.errstate(divide="ignore"):
+        worth = problem.action_value(here.value) + np.log(problem.prior) / problem.beta
+    best = worth.argmax(1)
+    together = noise + np.take_along_axis(noise, best[:, None], 1)
+    tied = worth.max(1)[:, None] - worth <= TIED * np.sqrt(together)
+    tied &= problem.beta**2 * together > 1  # else the second order has it
+    np.put_along_axis(tied, best[:, None], True, 1)
+    draws = np.random.default_rng(0).standard_normal((SIGNS, 1, problem.n_actions)) * np.sqrt(noise)
+    exponent = np.where(tied, problem.beta * draws, -np.inf)
+    gained = (special.logsumexp(exponent, axis=2) - np.log(tied.sum(1))).mean(0) / problem.beta
+    had = 0.5 * problem.beta * (policy * (1 - policy) * noise).sum(1)
+    return float((here.d.sum(1) * np.where(tied.sum(1) > 1, np.maximum(gained - had, 0.0), 0.0)).sum())
 
 
 def _withheld(variance: float, bias: float, untried: float) -> str:

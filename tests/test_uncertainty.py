@@ -83,6 +83,37 @@ def test_interval_covers_where_an_event_may_be_unseen():
     assert withheld < 20
 
 
+def test_interval_covers_where_a_slip_may_be_unseen():
+    """A row of 10 states, the last pays 3; any step slips to the start with chance .02. Pairs near the end have some 30
+    draws, and every other one of them shows no slip: an agent that never slipped would stay there for ever."""
+    p, r = np.zeros((10, 2, 10)), np.full((10, 2), -0.1)
+    for s in range(10):
+        for a, to in enumerate(((s + 1) % 10, max(s - 1, 0))):
+            p[s, a, to] += 0.98
+            p[s, a, 0] += 0.02
+    r[9] = 3.0
+    inside, _, withheld = coverage(TabularMDP(p, r, np.eye(10)[0]), 2.0, 1, 4000, n=50)
+    assert inside >= 0.9
+    assert withheld == 0
+
+
+def test_interval_covers_where_the_best_is_the_luckiest():
+    """Twenty arms that pay 0 and normal noise, beta 10^6: the best mean is 1.87 standard errors above 0, and in 2
+    cases of 5 one is above 1.96."""
+    rng = np.random.default_rng(0)
+    a, zero, inside = np.repeat(np.arange(20), 50), np.zeros(1000, int), 0
+    for _ in range(100):
+        data = Transitions(zero, a, rng.standard_normal(1000), zero, zero)
+        low, high = theta_uncertainty(empirical_mdp(data, 1, 20), 1e6).interval()
+        inside += low <= 0 <= high
+    assert inside >= 90
+
+
+def test_a_level_too_small_to_tell_from_0_is_the_value():
+    found = theta_uncertainty(empirical_mdp(collect(CLIFF, 200, 1000, 0), 15, 4), 5.0)
+    assert found.interval(1e-17) == (found.value, found.value)
+
+
 @pytest.mark.parametrize("k", [2, 5, 40])
 def test_interval_is_that_of_a_binomial_likelihood(k):
     """State 0 leads to 1 in k of 500 draws, 1 leads back: J = q/(1+q). The likelihood's interval goes along with any
