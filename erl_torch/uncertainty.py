@@ -16,7 +16,7 @@ The interval is that of the likelihood (Owen's, with a successor that was never 
     sum_{s,a} n(s,a) (sum_s' p log(p/q) + dr^2 / (2 Var(r | s,a,s'))) <= t^2 / 2,
 
 p the frequencies, q the model's rows, dr what its mean reward is off beyond what q makes of it. A row may also lead
-where another action leads that shares its state and a successor with it, or where half of the states lead, or, where
+where another action leads that shares its state and a successor with it, or where most states lead, or, where
 a successor has one draw alone, anywhere: n draws may hide an event of chance 1 - exp(-t^2/2n). Few events make the
 interval wide and lopsided; where much was seen it is value -+ t se. Each end is found by steps: to the models worst
 to first order, J there, and on.
@@ -72,7 +72,7 @@ PATIENCE = 10  # steps that gain nothing, where J has kinks
 FAR = 100.0  # logarithm of the price at which likelihood is given away
 CLOSE = 0.01  # part of the half width by which an end of the interval may fall short
 TIED = 2.0  # standard errors between two actions' values, up to which either may be the better
-COMMON = 0.5  # share of the states from which a successor is met anywhere
+COMMON = 0.5  # share of the states; a successor met from more of them may be met from any
 
 
 @dataclass(frozen=True, eq=False)
@@ -445,8 +445,8 @@ def _with_successor(
     """(the problem's transitions, in every row with an entry of probability 0 for the successor of most ``worth`` [n]
     that it may hide; mean reward of each entry less the row's, 0 where it was not seen).
 
-    A row may hide what another action leads to that shares its state and a successor with it, and what is met from half
-    of the states (a reset, a slip); where it has a successor of one draw alone, any state.
+    A row may hide what another action leads to that shares its state and a successor with it, and what is met from most
+    states (a reset, a slip); where it has a successor of one draw alone, any state.
     """
     problem = part.problem
     p, n_actions = problem.transition, problem.n_actions
@@ -460,7 +460,7 @@ def _with_successor(
     place = np.flatnonzero(like.data == np.repeat(best, np.diff(like.indptr)))
     hidden = to[like.indices[place[np.searchsorted(place, like.indptr[:-1])]]]
     met = np.unique(np.stack([p.indices[p.data > 0], row[p.data > 0] // n_actions]), axis=1)[0]
-    common = np.flatnonzero(np.bincount(met, minlength=problem.n_states) >= COMMON * problem.n_states)
+    common = np.flatnonzero(np.bincount(met, minlength=problem.n_states) > COMMON * problem.n_states)
     if common.size:
         reset = common[np.argmax(worth[common])]
         hidden = np.where(worth[reset] > worth[hidden], reset, hidden)
