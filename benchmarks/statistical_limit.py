@@ -407,10 +407,11 @@ def write_coverage(command: str, n: int, *found: list[tuple[list[Any], int, int]
         rows.append([what, "all", "", "", f"{n * len(part) - given}", f"{hits / given:.3f}", "", "", "", ""])
     header = ["", "problem", "beta", "tuples", "withheld", "coverage", "theta above", "theta below", "width"]
     text = f"""coverage of the 95% interval of theta
-{n} datasets a problem, seeds 0 to {n - 1}. The rules of the interval were settled on the first problems; the fresh ones
-were run once the rules stood. Coverage is of the intervals that are given; withheld: datasets without one. "Theta
-above" and "theta below": shares of the intervals given that miss it on that side. Width: median, in those of value -+
-1.96 standard errors, whose own coverage, on all datasets, is in the last column. What is assumed: docs/theory.md, 4."""
+{n} datasets a problem, seeds 0 to {n - 1}. The rules of the interval were settled on the first problems; none was
+made for the fresh ones, of which the rooms and the arms met the rules as they stand, and the others earlier ones as
+well. Coverage is of the intervals that are given; withheld: datasets without one. "Theta above" and "theta below":
+shares of the intervals given that miss it on that side. Width: median, in those of value -+ 1.96 standard errors,
+whose own coverage, on all datasets, is in the last column. What is assumed: docs/theory.md, 4."""
     write("coverage", command, text, [*header, "value +- 1.96 se"], rows)
 
 

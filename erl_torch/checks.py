@@ -339,7 +339,6 @@ def sparse(key: str, value: Any, shape: Shape, more: str = "") -> sp.csr_array:
         raise InputError(key, "sparse matrix", f"one with indices in range ({error})") from error
     csr.sum_duplicates()
     csr.eliminate_zeros()
-    csr.sort_indices()
     return csr
 
 

@@ -148,8 +148,10 @@ def _attempt(work: Callable[..., Any], cfg: DictConfig, directory: Path, shared:
         except BY_RUN:
             if not held and {entry.name for entry in directory.iterdir()} <= {".hydra"}:
                 shutil.rmtree(directory)
-                with contextlib.suppress(OSError):  # not empty: other runs
-                    directory.parent.rmdir()
+                above = directory.resolve().parent
+                if above not in (Path.cwd(), *Path.cwd().parents):
+                    with contextlib.suppress(OSError):  # not empty: other runs
+                        above.rmdir()
             raise
 
 

@@ -31,7 +31,7 @@ from erl_torch.board import Board, hyperparameters, replica_layout
 from erl_torch.checkpoint import Checkpoints, rows_of
 from erl_torch.checks import InputError
 from erl_torch.evaluation import Judge, evaluate
-from erl_torch.experience import collect
+from erl_torch.experience import COLUMN_BYTES, collect
 from erl_torch.files import read_npy, write_json, write_png
 from erl_torch.learners import Exact, NonFiniteError
 from erl_torch.learners.fitting import columns
@@ -75,6 +75,7 @@ QUANTITIES = {
     "objective": "objective J, reward a step",
     "return": "return of an episode, reward",
 }  # what is logged of replicas, as far as there is
+FEW = 24  # replicas whose simulated streams are sampled once more, to hold theta against what they say
 MOST_LOGGED = 24  # groups with curves of their own; all are in result.json and in the pictures
 
 
@@ -124,7 +125,7 @@ def train_replicas(cfg: DictConfig, directory: Path, safe_point: SafePoint, save
         n_experience = max(_lengths(experience))
         judge = _Judges(cfg, env, world, prior, [one.beta for one in learners], seeds, threads)
 
-        asked, data = _reservations(experience, learners, prior, judge.model, cfg.evaluation.certify)
+        asked, data = _reservations(experience, learners, prior, judge.model, cfg.evaluation.certify, safe_point)
         for said in asked:
             note(said)
         exact = _exact(cfg, judge, groups)
@@ -442,7 +443,12 @@ class Data(NamedTuple):
 
 
 def _reservations(
-    experience: Experience, learners: list[Any], prior: np.ndarray, model: TabularMDP | None, certify: bool
+    experience: Experience,
+    learners: list[Any],
+    prior: np.ndarray,
+    model: TabularMDP | None,
+    certify: bool,
+    safe_point: SafePoint,
 ) -> tuple[list[str], list[Data]]:
     """(notes on what streams do not allow the learners, what theta is to be held against); each stream is read once.
     Theta is not held against the model's."""
@@ -460,11 +466,13 @@ def _reservations(
             draws = np.rint(experience.n_tuples * table / len(table))  # as if it were in all states alike
             own += reservations.of_actions(draws, prior, "a")
         held = [Data(rewards, None)] * len(learners)
-        if certify and experience.mdp.n_states <= SMALL:
+        few = len(learners) <= FEW and experience.n_tuples * COLUMN_BYTES <= KEEP_BYTES
+        if certify and few and experience.mdp.n_states <= SMALL:
             same: dict[int, list[int]] = {}
             for r, seed in enumerate(experience.seeds):
                 same.setdefault(int(seed), []).append(r)
             for members in same.values():
+                safe_point()
                 here = reservations.count(experience.stream(members[0], prior), shape[0], shape[1], False)
                 for r in members:
                     held[r] = data_of(here, learners[r])
@@ -478,7 +486,9 @@ def _reservations(
         if id(data) not in counted:
             counted[id(data)] = reservations.count(data, shape[0], shape[1], next_actions)
         here = counted[id(data)]
-        against = [] if model is None else reservations.of_model(here, model)
+        against = (
+            [] if model is None else reservations.of_model(here, model) + reservations.of_states(here.tally, model)
+        )
         found.append(reservations.of_stream(here, learner, prior) + against)
         held.append(data_of(here, learner))
     return reservations.of_replicas(found), held

@@ -17,8 +17,10 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy.sparse as sp
 from scipy.special import rel_entr
 
+from erl_torch.chains import reachable_from
 from erl_torch.checks import InputError
 from erl_torch.empirical import EmpiricalMDP, Tally, empirical_mdp, tally
 from erl_torch.mdp import TabularMDP
@@ -30,6 +32,8 @@ LEVEL = 1e-9  # chance, at most, that data as they should be are spoken of
 EXPECTED = 1.0  # draws, below which cells are pooled
 MATTERS = 1e-4  # beta^2 Var/2: share of exp(beta r) that noise in rewards adds
 SINGLE = 1e-6  # relative: rewards recorded in single precision are the same
+BEYOND = 1e-3  # of the largest reward: theta out of the range of rewards by more is wrong
+NO_CHANCE = 0.02  # of the range of rewards: so far theta may be from that of data without any chance
 FAR = 10.0  # half widths of the 95% interval, from which a learnt theta is far from the data's
 
 
@@ -184,19 +188,17 @@ def of_model(
     said = [*_transitions(counted.tally, mdp), *_rewards(counted, mdp)]
     if estimate is not None and bounds is not None and _covered(counted.tally, mdp):
         low, high = estimate.interval(1 - LEVEL)
-        if low > bounds[1] or high < bounds[0]:
+        # So far out no interval is exact: it has to be far in units of the usual one too.
+        far = min(half_widths(bound, estimate) for bound in bounds) > FAR
+        if far and (low > bounds[1] or high < bounds[0]):
             said.append(
                 f"their theta is {estimate.value:.6g}, standard error {estimate.standard_error:.2g}, "
                 f"the model's {proven(bounds, None)}"
             )
     if not said:
         return []
-    return [
-        Reservation(
-            "data contradict the model",
-            f"the data contradict the model: {'; '.join(said)}. What is proven is of the model alone",
-        )
-    ]
+    text = f"the data contradict the model: {'; '.join(said)}. What is proven is of the model alone"
+    return [Reservation("data contradict the model", text)]
 
 
 def _entries(found: Tally, mdp: TabularMDP) -> tuple[np.ndarray, np.ndarray]:
@@ -254,6 +256,23 @@ def _rewards(counted: Counted, mdp: TabularMDP) -> Iterator[str]:
         )
 
 
+def of_states(found: Tally, mdp: TabularMDP) -> list[Reservation]:
+    """Whether ``mdp`` reaches states from those met that the stream does not meet."""
+    met = found.visits.reshape(mdp.n_states, mdp.n_actions).any(1)
+    met[found.indices] = True
+    p = mdp.transition
+    n_entries = p.indptr[:: mdp.n_actions]  # of the actions of a state together
+    reached = reachable_from(sp.csr_array((p.data, p.indices, n_entries), shape=(mdp.n_states,) * 2), met)
+    unmet = int((reached & ~met).sum())
+    if not unmet:
+        return []
+    text = (
+        f"the stream meets {met.sum():,} of the {reached.sum():,} states that the model can reach: what the data say "
+        "of theta, and its interval, is of the part that was met"
+    )
+    return [Reservation("states never met", text)]
+
+
 def _covered(found: Tally, mdp: TabularMDP) -> bool:
     """Whether every action is tried in every state met, and no state that these lead to is missing: theta is theirs."""
     tried = found.visits.reshape(mdp.n_states, mdp.n_actions) > 0
@@ -295,7 +314,7 @@ def of_theta(theta: float | None, rewards: tuple[float, float], estimate: Estima
         return []
     low, high = 0.0 - rewards[1], 0.0 - rewards[0]  # no -0
     outside = max(low - theta, theta - high)
-    if outside > SINGLE * max(abs(low), abs(high)):
+    if outside > BEYOND * max(abs(low), abs(high)):
         return [
             Reservation(
                 "theta out of range",
@@ -303,8 +322,19 @@ def of_theta(theta: float | None, rewards: tuple[float, float], estimate: Estima
                 f"the stream, theta* lies in [{low:.6g}, {high:.6g}], whatever the dynamics",
             )
         ]
+    if estimate is None:
+        return []
     away = half_widths(theta, estimate)
-    if estimate is None or not away > FAR:
+    if estimate.standard_error == 0 and abs(theta - estimate.value) > NO_CHANCE * (rewards[1] - rewards[0]):
+        return [
+            Reservation(
+                "theta far from the data's",
+                f"the learnt theta is {theta:.6g}, and that of the data, in which nothing is left to chance, is "
+                f"{estimate.value:.6g}: more passes or other steps come closer, if the learner solves the same problem "
+                "(docs/learners.md); learner=certainty_equivalence does",
+            )
+        ]
+    if not away > FAR:
         return []
     low, high = estimate.interval(1 - LEVEL)
     if low <= theta <= high:
@@ -313,7 +343,8 @@ def of_theta(theta: float | None, rewards: tuple[float, float], estimate: Estima
         Reservation(
             "theta far from the data's",
             f"the learnt theta {theta:.6g} is {away:.3g} half widths from what the data say, {estimate} (95%): more "
-            "passes, other steps or learner=certainty_equivalence come closer",
+            "passes or other steps come closer, if the learner solves the same problem (docs/learners.md); "
+            "learner=certainty_equivalence does",
         )
     ]
 

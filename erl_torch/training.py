@@ -227,6 +227,7 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
         result["data"] = None
     result["data_smallest_visits"] = None if estimate is None or estimate.withheld else estimate.smallest_visits
     away = reservations.half_widths(solution.theta, estimate)
+    result["data_states"] = None if estimate is None else run.states_met
     result["data_half_widths"] = away if np.isfinite(away) else None
     result["n_skipped"] = run.n_skipped
     result["notes"] = notes
@@ -356,7 +357,15 @@ class _Learning:
     ) -> list[Reservation]:
         """What the stream does not allow the learner, and where it contradicts the model."""
         found = reservations.of_stream(self.counted, self.learner, prior)
-        return found + ([] if judge is None else reservations.of_model(self.counted, judge, estimate, bounds))
+        if judge is not None:
+            found += reservations.of_model(self.counted, judge, estimate, bounds)
+            found += reservations.of_states(self.counted.tally, judge)
+        return found
+
+    @property
+    def states_met(self) -> list[int]:
+        """[states in which the stream acts, states there are]."""
+        return [int(self.counted.tally.visits.reshape(self.sizes).any(1).sum()), self.sizes[0]]
 
     def outcome(self, theta: float | None, estimate: Estimate | None) -> list[Reservation]:
         """What the learnt theta shows."""
@@ -838,8 +847,11 @@ def _summary(
         lines.append(f"{'proven':18}{proven(result['theta_bounds'], result['gap'])}")
     if result["data"]:
         fewest, away = result["data_smallest_visits"], result["data_half_widths"]
-        rests = "" if fewest is None else f" (95%; {fewest} visit{'s' * (fewest > 1)} or more of each pair that counts)"
-        rests += f"; learnt: {away:.3g} half widths off" if away is not None and away > 1 else ""
+        met = result["data_states"]
+        of = "" if met is None or met[0] == met[1] else f"{met[0]:,} of {met[1]:,} states met, "
+        each = f"{fewest} visit{'s' * (fewest != 1)} or more of each pair that counts"
+        rests = "" if fewest is None else f" (95%; {of}{each})"
+        rests += f"; learnt: {away:.2f} half widths from its middle" if away is not None and away > 1 else ""
         lines.append(f"{'the data say':18}{result['data']}{rests}")
     if result["n_experience"]:
         rate = done / max(result["seconds_learning"], 1e-3) / 1e6

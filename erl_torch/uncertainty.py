@@ -65,12 +65,14 @@ from erl_torch.solvers.soft_bellman import solve_problem
 COUNTS = 0.01  # share of the variance from which a pair counts
 BIAS_STATES = 1000  # beyond, the second order is an average over random signs: exact, it takes S linear systems
 SIGNS = 100
+FALLS_APART = "the policy's chain falls into parts that double precision cannot join"
+MOST_DIGITS = 15
 LOPSIDED = 0.1  # the middle's distance from the value, in half widths
 HALF = 0.5  # of the plug-in's standard error, that of resamples at least
 MAX_STEPS = 50
 PATIENCE = 10  # steps that gain nothing, where J has kinks
 FAR = 100.0  # logarithm of the price at which likelihood is given away
-CLOSE = 0.01  # part of the half width by which an end of the interval may fall short
+CLOSE = 0.01  # part of the half width: an end of the interval is found where a step moves it by less
 TIED = 2.0  # standard errors between two actions' values, up to which either may be the better
 COMMON = 0.5  # share of the states; a successor met from more of them may be met from any
 
@@ -121,16 +123,23 @@ class Estimate:
         return [(int(k // drop.shape[1]), int(k % drop.shape[1]), float(drop.flat[k])) for k in order]
 
     def __str__(self) -> str:
+        if np.isnan(self.value):
+            return f"no {self.name}: {self.withheld}"
         if self.withheld:
-            return f"{self.name} = {self.value:.4f}, no interval: {self.withheld}"
+            return f"{self.name} = {self.value:.4g}, no interval: {self.withheld}"
         low, high = self.interval()
-        half = (high - low) / 2
+        near = min(self.value - low, high - self.value)
         digits = 4
-        if half > 0:
-            first = int(np.floor(np.log10(half)))  # of its digits; two are shown where the first is a 1
-            digits = max(0, (half < 2 * 10.0**first) - first)
-        if abs(0.5 * (low + high) - self.value) > LOPSIDED * half:
+        if near > 0:
+            first = int(np.floor(np.log10(near)))  # of its digits; two are shown where the first is a 1
+            digits = min(max(0, (near < 2 * 10.0**first) - first), MOST_DIGITS)
+        # What is printed holds what is meant.
+        unit = 10.0**-digits
+        if abs(0.5 * (low + high) - self.value) > LOPSIDED * 0.5 * (high - low):
+            low, high = np.floor(low / unit) * unit, np.ceil(high / unit) * unit
             return f"{self.name} = {self.value:.{digits}f} in [{low:.{digits}f}, {high:.{digits}f}]"
+        shown = float(f"{self.value:.{digits}f}")
+        half = np.ceil(max(high - shown, shown - low) / unit - 1e-9) * unit
         return f"{self.name} = {self.value:.{digits}f} +- {half:.{digits}f}"
 
 
@@ -155,10 +164,7 @@ def theta_uncertainty(model: EmpiricalMDP, beta: float, prior_policy: Any = None
     try:
         found = _plug_in(model, part, policy[part.problem.states], optimal=True)
     except SingularChainError:  # the optimum keeps to a part that the process leaves at last, or all but closed parts
-        bounds = solution.theta_bounds
-        assert bounds is not None
-        reason = "the optimal policy's chain falls into parts that double precision cannot join"
-        return Estimate("theta", 0.5 * sum(bounds), np.inf, withheld=reason)
+        return Estimate("theta", np.nan, np.inf, withheld=FALLS_APART)
     limits = found.limits
     return replace(
         found,
@@ -188,7 +194,10 @@ def policy_uncertainty(model: EmpiricalMDP, policy: Any, beta: float, prior_poli
     if untried.any():
         s, a = np.argwhere(untried)[0]
         raise InputError(f"policy[{s}, {a}]", table[s, a], "0, as the pair is not in the data")
-    return _plug_in(model, part, table[part.problem.states], optimal=False)
+    try:
+        return _plug_in(model, part, table[part.problem.states], optimal=False)
+    except SingularChainError:  # a worth for each part
+        return Estimate("J", np.nan, np.inf, withheld=FALLS_APART)
 
 
 def bootstrap_theta(
@@ -520,9 +529,8 @@ def _second_order(
         return np.asarray(y + d @ (x - y))
 
     exact = n <= BIAS_STATES
-    signs = np.random.default_rng(0).choice([-1.0, 1.0], (SIGNS, n))
     terms = []
-    for x in np.eye(n) if exact else signs:
+    for x in np.eye(n) if exact else np.random.default_rng(0).choice([-1.0, 1.0], (SIGNS, n)):
         term = float(x @ (matrix @ through(x)))
         if optimal:
             h = (problem.transition @ through(np.sqrt(source) * x)).reshape(n, n_actions)

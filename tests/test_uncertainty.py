@@ -1,5 +1,7 @@
 """Errors on theta and on a policy's value: coverage, derivatives, and what they depend on."""
 
+import re
+
 import numpy as np
 import pytest
 import scipy.sparse as sp
@@ -109,6 +111,31 @@ def test_interval_covers_where_the_best_is_the_luckiest():
     assert inside >= 90
 
 
+@pytest.mark.parametrize("width", [3e-7, 0.0213, 0.4, 7.0])
+@pytest.mark.parametrize("middle", [0.0, 1.00136, -812.3])
+@pytest.mark.parametrize("lean", [0.0, 0.3])
+def test_what_is_printed_holds_what_is_meant(middle, width, lean):
+    value = middle + lean * width
+    low, high = middle - width, middle + width
+    found = Estimate("theta", value, width, limits=lambda budget: (low, high))
+    numbers = [float(x) for x in re.findall(r"-?\d+\.?\d*", str(found))]
+    shown = numbers[1:] if "[" in str(found) else [numbers[0] - numbers[1], numbers[0] + numbers[1]]
+    slack = 1e-12 * (1 + abs(middle))  # of reading the text
+    assert shown[0] <= low + slack
+    assert shown[1] >= high - slack
+    assert shown[1] - shown[0] <= 2 * (high - low)
+
+
+def test_a_policy_whose_chain_falls_apart_has_no_worth():
+    """Two states; action 0 stays: there is a worth for each."""
+    s, a = np.array([0, 0, 1, 1, 0]), np.array([0, 1, 0, 1, 0])
+    data = Transitions(s, a, s * 1.0, np.array([0, 1, 1, 0, 0]), 0 * s)
+    found = policy_uncertainty(empirical_mdp(data, 2, 2), [[1, 0], [1, 0]], 1.0)
+    assert np.isnan(found.value)
+    assert str(found) == f"no J: {found.withheld}"
+    assert found.withheld
+
+
 def test_a_level_too_small_to_tell_from_0_is_the_value():
     found = theta_uncertainty(empirical_mdp(collect(CLIFF, 200, 1000, 0), 15, 4), 5.0)
     assert found.interval(1e-17) == (found.value, found.value)
@@ -210,7 +237,7 @@ def test_interval_is_withheld_where_it_says_nothing():
     assert estimate.value == pytest.approx(-0.5)
     assert estimate.withheld == "no pair shows any variance"
     assert estimate.interval() == (-np.inf, np.inf)
-    assert str(estimate) == "theta = -0.5000, no interval: no pair shows any variance"
+    assert str(estimate) == "theta = -0.5, no interval: no pair shows any variance"
     reasons = set()
     for seed in range(40):
         found = theta_uncertainty(empirical_mdp(collect(rare(0.002), 1, 1000, seed), 2, 2), 1.0)
@@ -393,8 +420,8 @@ def test_a_policy_off_the_data_is_refused():
 
 
 def test_as_text():
-    assert str(Estimate("theta", 1.01184, 0.0009 / 1.96)) == "theta = 1.0118 +- 0.0009"
-    assert str(Estimate("theta", 1.01184, 0.00164 / 1.96)) == "theta = 1.0118 +- 0.0016"
+    assert str(Estimate("theta", 1.01184, 0.0009 / 1.96)) == "theta = 1.0118 +- 0.0010"
+    assert str(Estimate("theta", 1.01184, 0.00164 / 1.96)) == "theta = 1.0118 +- 0.0017"
     assert str(Estimate("J", -12.3, 2.0)) == "J = -12 +- 4"
     assert str(Estimate("J", 0.5, 0.0)) == "J = 0.5000 +- 0.0000"
     assert Estimate("J", 0.0, 1.0).interval(0.6827) == pytest.approx((-1, 1), abs=1e-4)
