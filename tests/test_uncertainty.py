@@ -422,7 +422,7 @@ def test_a_policy_off_the_data_is_refused():
 def test_as_text():
     assert str(Estimate("theta", 1.01184, 0.0009 / 1.96)) == "theta = 1.0118 +- 0.0010"
     assert str(Estimate("theta", 1.01184, 0.00164 / 1.96)) == "theta = 1.0118 +- 0.0017"
-    assert str(Estimate("J", -12.3, 2.0)) == "J = -12 +- 4"
+    assert str(Estimate("J", -12.3, 2.0)) == "J = -12 +- 5"
     assert str(Estimate("J", 0.5, 0.0)) == "J = 0.5000 +- 0.0000"
     assert Estimate("J", 0.0, 1.0).interval(0.6827) == pytest.approx((-1, 1), abs=1e-4)
     with pytest.raises(InputError, match="level"):
