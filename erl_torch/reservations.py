@@ -258,7 +258,7 @@ def _rewards(counted: Counted, mdp: TabularMDP) -> Iterator[str]:
 
 def of_states(found: Tally, mdp: TabularMDP) -> list[Reservation]:
     """Whether ``mdp`` reaches states from those met that the stream does not meet."""
-    met = found.visits.reshape(mdp.n_states, mdp.n_actions).any(1)
+    met: np.ndarray = np.asarray(found.visits.reshape(mdp.n_states, mdp.n_actions).any(1))
     met[found.indices] = True
     p = mdp.transition
     n_entries = p.indptr[:: mdp.n_actions]  # of the actions of a state together

@@ -409,6 +409,7 @@ class _Solving:
 
     unit = "iterations"
     n_experience = n_skipped = 0
+    states_met = None
     digest = None  # no stream, and no checkpoints: it begins anew
 
     def __init__(
