@@ -39,6 +39,7 @@ from numpy.lib import format as npy
 from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.envs.discretise import Discretise
+from erl_torch.files import check_directory
 from erl_torch.mdp import check_policy
 from erl_torch.rng import streams
 from erl_torch.transitions import COLUMNS, Checksum, Recording, Transitions, join, regroup
@@ -272,6 +273,7 @@ class _Npy:
                 files[name] = stack.enter_context(path.open("rb"))
             return {name: (file, os.fstat(file.fileno()).st_size) for name, file in files.items()}
         archive = stack.enter_context(zipfile.ZipFile(self.path))
+        check_directory(archive)
         found: dict[str, tuple[BinaryIO, int]] = {}
         for name in COLUMNS:
             if f"{name}.npy" not in archive.namelist():
