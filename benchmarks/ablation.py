@@ -81,9 +81,9 @@ def main() -> None:
         f"    {command}\n",
         f"Windy cliff, beta 10, 500,000 tuples of the uniform prior, at most 90 passes, {n_seeds} streams; every",
         "row sees the same streams. Loss: g* - J of the last policy in the true MDP, reward a step. KL(optimal ||",
-        "learnt): mean over states, each counted alike (README's table weights them as the optimal policy visits them).",
-        "Published S1 is `s1_listing`, as the paper lists it. x CE: mean over that of certainty equivalence, which is",
-        "what the data allow.\n",
+        "learnt): mean over states, each counted alike (README's table weights them as the optimal policy visits",
+        "them). Published S1 is `s1_listing`, as the paper lists it. x CE: mean over that of certainty equivalence,",
+        "which is what the data allow.\n",
         "| learner | mean loss | x CE | largest loss | mean KL | x CE | passes |",
         "|---|---|---|---|---|---|---|",
     ]

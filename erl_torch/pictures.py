@@ -225,8 +225,10 @@ def _panels(n: int, title: str, caption: str, card: bool) -> tuple[Figure, list[
         left, bottom = (panel * column + 0.85) / width, (2.9 * (rows - 1 - row) + 0.55) / height
         panels.append(figure.add_axes((left, bottom, (panel - 1.05) / width, 2.15 / height)))
     left = (0.1 if card else 0.85) / width
-    figure.text(left, 1 - 0.28 / height, title, fontsize=9 if card else 11, weight="bold")
-    figure.text(left, 1 - 0.48 / height, caption, fontsize=8, color="#666666")
+    if card:
+        title = title.replace(": ", ":\n")
+    figure.text(left, 1 - (0.36 if card else 0.28) / height, title, fontsize=9 if card else 11, weight="bold")
+    figure.text(left, 1 - (0.55 if card else 0.48) / height, caption, fontsize=8, color="#666666")
     return figure, panels
 
 

@@ -81,8 +81,8 @@ def changed(array, index, value):
         ),
         (
             (FLAT[:5], R),
-            r"transition=array of shape \(5, 3\): must be of shape \[6, 3\] \(\[S\*A, S\]\) or \[3, 2, 3\] \(\[S, A, S\]\), "
-            r"as reward is \[3, 2\] \(\[S, A\]\): one of the two is wrong$",
+            r"transition=array of shape \(5, 3\): must be of shape \[6, 3\] \(\[S\*A, S\]\) or "
+            r"\[3, 2, 3\] \(\[S, A, S\]\), as reward is \[3, 2\] \(\[S, A\]\): one of the two is wrong$",
         ),
         (
             (sp.csr_array(FLAT[:5]), R),
