@@ -6,7 +6,7 @@ import math
 import numbers
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -285,7 +285,7 @@ def real(key: str, value: Any) -> np.ndarray:
     """``value`` as an array of real numbers, of its own type and shape; not copied where it is one.
 
     Raises InputError: text, dates, complex numbers, masked entries, tensors without data, and whatever else is no array
-    of real numbers.
+    of real numbers, or finds no room.
     """
     if is_sparse(value):
         whole = tuple(value.shape)
@@ -293,6 +293,8 @@ def real(key: str, value: Any) -> np.ndarray:
         value = _tensor(key, value).to_dense() if hasattr(value, "detach") else sparse(key, value, whole).toarray()
     if hasattr(value, "detach"):
         value = _tensor(key, value).numpy()
+    if isinstance(value, Sequence):
+        room(key, _lengths(value))
     if _masked(value):
         raise InputError(key, "an array with masked entries", "an array without")
     try:
@@ -349,6 +351,20 @@ def is_sparse(value: Any) -> bool:
     import scipy.sparse as sp
 
     return bool(sp.issparse(value))
+
+
+def _lengths(value: Sequence[Any]) -> tuple[int, ...]:
+    """Of a list and of what comes first in it, and so on: the shape of an array, before it is made."""
+    found: list[int] = []
+    while isinstance(value, Sequence) and not isinstance(value, str) and len(found) < MOST_DEEP:
+        try:
+            found.append(len(value))
+        except OverflowError:  # of a range
+            found.append(MOST)
+        if not found[-1]:
+            break
+        value = value[0]
+    return tuple(found)
 
 
 def _masked(value: Any, depth: int = 0) -> bool:

@@ -29,7 +29,7 @@ class Evaluation(NamedTuple):
 
     mean_return: float  # undiscounted return of an episode, mean over sampled episodes
     reward_per_step: float  # exact over the horizon where the model is known, else sampled
-    objective: float  # reward rate - KL/beta; exact (stationary) where the model is known, else sampled
+    objective: float  # stationary reward rate - KL/beta, as ``objective``, where the model is known; else sampled
 
 
 class PolicyChain(NamedTuple):
@@ -82,7 +82,8 @@ def induced_distribution(mdp: TabularMDP, policy: np.ndarray, horizon: int | Non
 def objective(mdp: TabularMDP, policy: np.ndarray, prior: np.ndarray, beta: float) -> float:
     """J(pi): stationary reward rate minus KL/beta, from the start distribution; reward a step.
 
-    ``certificates.objective`` has the same figure with bounds.
+    Exact but for rounding, unless products of probabilities underflow: then it is somewhere between the bounds that
+    ``certificates.objective`` has beside the same figure.
     """
     return certificates.objective(mdp.transition, mdp.reward, prior, beta, policy, mdp.start).value
 
@@ -98,7 +99,9 @@ def evaluate(
     mdp: TabularMDP | None = None,
     mean_return: Callable[[np.ndarray], float] | None = None,
 ) -> Evaluation:
-    """Evaluate ``policy`` [S, A]: exactly where the model is known, by playing episodes otherwise.
+    """Evaluate ``policy`` [S, A]: on the model where it is known, by playing episodes otherwise.
+
+    On the model, reward per step and objective are exact but for rounding, and but for what ``objective`` says.
 
     Args:
         source: where the episodes are played; they end after ``horizon`` steps, or where the environment ends them.

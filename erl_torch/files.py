@@ -17,6 +17,9 @@ from omegaconf import OmegaConf
 
 from erl_torch.checks import InputError
 
+END_BYTES, MOST_COMMENT = 22, (1 << 16) - 1  # of a zip's last record
+MOST_COUNTED = (1 << 16) - 1  # there: "more than that", or "see the larger record"
+
 
 def _write(path: str | os.PathLike[str], fill: Callable[[BinaryIO], None]) -> Path:
     path = Path(path)
@@ -140,15 +143,43 @@ def write_gif(path: str | os.PathLike[str], frames: Sequence[np.ndarray], fps: f
 def read_npz(path: str | os.PathLike[str], key: str = "path") -> dict[str, np.ndarray]:
     """All arrays of an npz file, without pickle.
 
-    Raises InputError (under ``key``) if the file is missing, damaged, or holds objects.
+    Raises InputError (under ``key``) if the file is missing, damaged, or holds objects; it names the damaged member.
     """
+    member = ""
     try:
-        # Opened here: np.load leaves the file open when it meets a damaged one.
-        with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
+        with zipfile.ZipFile(path) as archive:
+            check_directory(archive)
+            found = {}
+            for member in archive.namelist():
+                with archive.open(member) as file:
+                    found[member.removesuffix(".npy")] = np.lib.format.read_array(file, allow_pickle=False)
+                    # np.load leaves these unread, and the checksum, which is looked at where a member ends.
+                    if rest := len(file.read()):
+                        raise ValueError(f"{rest} bytes too many")
+            return found
     except Exception as error:
-        # np.load answers damage with a dozen kinds of exception, zlib's and struct's among them.
-        raise InputError(key, path, f"a readable npz file without pickled objects ({error})") from error
+        # Damage is answered with a dozen kinds of exception, zlib's and struct's among them.
+        said = f"{member}: {error}" if member else f"{error}"
+        raise InputError(key, path, f"a readable npz file without pickled objects ({said})") from error
+
+
+def check_directory(archive: zipfile.ZipFile) -> None:
+    """Raise ValueError unless ``archive`` has the members that its last record counts, each array once.
+
+    A damaged length in the directory makes one entry swallow those after it, which nothing else tells.
+    """
+    file = archive.fp
+    assert file is not None
+    size = file.seek(0, os.SEEK_END)
+    file.seek(max(0, size - END_BYTES - MOST_COMMENT))
+    tail = file.read()
+    begin = tail.rfind(b"PK\x05\x06")
+    counted = int.from_bytes(tail[begin + 10 : begin + 12], "little")
+    names = [name.removesuffix(".npy") for name in archive.namelist()]
+    if counted not in (len(names), MOST_COUNTED):
+        raise ValueError(f"{counted} members are announced, and {len(names)} listed")
+    if len(set(names)) < len(names):
+        raise ValueError(f"{next(name for name in names if names.count(name) > 1)} is there twice")
 
 
 def read_npy(path: str | os.PathLike[str], key: str = "path") -> np.ndarray:

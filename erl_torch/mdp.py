@@ -174,11 +174,14 @@ def _csr_of_parts(parts: Sequence[np.ndarray], sizes: tuple[int, ...]) -> sp.csr
 
 def _csr(value: Any, n_states: int, n_actions: int) -> sp.csr_array:
     shape = (n_states * n_actions, n_states)
+    more = " ([S*A, S])"
     if not checks.is_sparse(value):
         value = checks.real("transition", value)
         if value.shape == (n_states, n_actions, n_states):
             value = value.reshape(shape)
-    return checks.sparse("transition", value, shape, f" to go with reward [{n_states}, {n_actions}]")
+        more += f" or [{n_states}, {n_actions}, {n_states}] ([S, A, S])"
+    more += f", as reward is [{n_states}, {n_actions}] ([S, A]): one of the two is wrong"
+    return checks.sparse("transition", value, shape, more)
 
 
 def _row_name(row: int, n_actions: int) -> str:

@@ -175,17 +175,20 @@ class BandLine(NamedTuple):
     name: str
     x: Sequence[float]
     statistics: Sequence[Mapping[str, float]]  # mean, q25, q75, min, max at each x
-    exact: Sequence[float | None]  # at each x, drawn dashed
+    exact: Sequence[float | None]  # at each x
 
 
 def bands(
     panels: Mapping[str, Sequence[BandLine]], x_label: str, title: str, markers: bool = False, card: bool = False
 ) -> np.ndarray:
-    """Statistics over replicas, a panel for each label: mean, quartiles (shaded), extremes (thin).
+    """Statistics over replicas, a panel for each label: mean, quartiles (shaded), extremes (thin), exact values.
 
+    ``markers``: each x is a setting, and exact values are known there alone: crosses, else a dashed line.
     ``card``: small enough for a card of TensorBoard's, which takes one panel.
     """
-    figure, all_axes = _panels(len(panels), title, "mean; shaded: quartiles; thin: extremes; dashed: exact", card)
+    exact: dict[str, Any] = {"linestyle": "", "marker": "x", "markersize": 5} if markers else {"linestyle": "--"}
+    caption = f"mean; shaded: quartiles; thin: extremes; {'crosses' if markers else 'dashed'}: exact"
+    figure, all_axes = _panels(len(panels), title, caption, card)
     for axes, (label, lines) in zip(all_axes, panels.items(), strict=True):
         for i, line in enumerate(lines):
             colour = COLOURS[i % len(COLOURS)]
@@ -197,8 +200,8 @@ def bands(
                 axes.plot(line.x, column[end], color=colour, linewidth=0.5, alpha=0.8, zorder=2)
             known = [(x, y) for x, y in zip(line.x, line.exact, strict=True) if y is not None]
             if known:
-                axes.plot(*zip(*known, strict=True), color="#222222" if len(lines) == 1 else colour, linestyle="--",
-                          linewidth=1.0, zorder=2.5)  # fmt: skip
+                axes.plot(*zip(*known, strict=True), color="#222222" if len(lines) == 1 else colour,
+                          linewidth=1.0, zorder=3.5 if markers else 2.5, **exact)  # fmt: skip
         spread = [x for line in lines for x in line.x]
         if markers and min(spread) > 0 and max(spread) / min(spread) >= 20:
             axes.set_xscale("log")
@@ -222,8 +225,10 @@ def _panels(n: int, title: str, caption: str, card: bool) -> tuple[Figure, list[
         left, bottom = (panel * column + 0.85) / width, (2.9 * (rows - 1 - row) + 0.55) / height
         panels.append(figure.add_axes((left, bottom, (panel - 1.05) / width, 2.15 / height)))
     left = (0.1 if card else 0.85) / width
-    figure.text(left, 1 - 0.28 / height, title, fontsize=9 if card else 11, weight="bold")
-    figure.text(left, 1 - 0.48 / height, caption, fontsize=8, color="#666666")
+    if card:
+        title = title.replace(": ", ":\n")
+    figure.text(left, 1 - (0.36 if card else 0.28) / height, title, fontsize=9 if card else 11, weight="bold")
+    figure.text(left, 1 - (0.55 if card else 0.48) / height, caption, fontsize=8, color="#666666")
     return figure, panels
 
 

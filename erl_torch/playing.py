@@ -56,8 +56,9 @@ def play(cfg: DictConfig) -> Played:
     module, colon, _ = str(settings.env.id).partition(":")
     if cfg.module != (module if colon else None):
         if colon:
-            raise InputError("module", cfg.module, f"{module}, which makes the run's environment and is imported")
-        raise InputError("module", cfg.module, f"left out: the environment of {run} is of none")
+            allowed = f"typed as module={module}: it makes the run's environment, and runs only if you name it"
+            raise InputError("module", cfg.module, allowed)
+        raise InputError("module", cfg.module, f"left out: no module makes the environment of {run}")
     table = run_policy(run, cfg.replica)
     mode = MODES.get(cfg.render)
     with contextlib.closing(make_env(settings.env)) as plain:

@@ -13,7 +13,7 @@ pass over it checks again, since a file may change.
 A bad tuple (a state or action out of range, a reward that is not finite, a missing value) is named by file and row,
 and ends the reading; with ``on_bad="skip"`` it is left out and counted, as are the rows for which a column of a
 directory or npz is too short. A damaged npz, Parquet or Minari file ends the reading with either: none of its rows can
-be trusted.
+be trusted. (Damage shows by the file's own checksums, which Parquet has only where its writer was asked for them.)
 
 Minari's episodes become tuples as ``erl_torch.experience`` has them. Where an episode terminated, s' is the first state
 of the next one (the first episode follows the last); where it was truncated, or just ends, s' is the state reached.
@@ -39,6 +39,7 @@ from numpy.lib import format as npy
 from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.envs.discretise import Discretise
+from erl_torch.files import check_directory
 from erl_torch.mdp import check_policy
 from erl_torch.rng import streams
 from erl_torch.transitions import COLUMNS, Checksum, Recording, Transitions, join, regroup
@@ -272,6 +273,7 @@ class _Npy:
                 files[name] = stack.enter_context(path.open("rb"))
             return {name: (file, os.fstat(file.fileno()).st_size) for name, file in files.items()}
         archive = stack.enter_context(zipfile.ZipFile(self.path))
+        check_directory(archive)
         found: dict[str, tuple[BinaryIO, int]] = {}
         for name in COLUMNS:
             if f"{name}.npy" not in archive.namelist():

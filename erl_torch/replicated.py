@@ -211,7 +211,8 @@ def train_replicas(cfg: DictConfig, directory: Path, safe_point: SafePoint, save
                     ended.keep(saved, state.n_tuples, lambda: snapshot() | reached)
             solution = replicas.solution(state, history)
             done = int(history[-1]["n_tuples"].sum())
-            title = f"{cfg.env.name}, {cfg.learner.name}: {plural(cfg.n_replicas, 'replica')}"
+            each = " of each setting" if len(groups) > 1 else ""
+            title = f"{cfg.env.name}, {cfg.learner.name}: {plural(cfg.n_replicas, 'replica')}{each}"
             drawn = [("bands", record.curves(exact), "tuples streamed, each replica", title)]
             if cfg.vary:
                 key, panels = _sweep(groups, record, exact)

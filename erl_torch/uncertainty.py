@@ -147,6 +147,10 @@ def _normal(level: float) -> float:
     return NormalDist().inv_cdf((1 + level) / 2)
 
 
+def _check_model(model: Any) -> None:
+    checks.instance("model", model, EmpiricalMDP, "an EmpiricalMDP, as of empirical_mdp")
+
+
 def theta_uncertainty(model: EmpiricalMDP, beta: float, prior_policy: Any = None) -> Estimate:
     """Plug-in estimate of theta* from counts, less its bias of second order, with its error (docs/theory.md, 4).
 
@@ -158,6 +162,7 @@ def theta_uncertainty(model: EmpiricalMDP, beta: float, prior_policy: Any = None
     Raises:
         InputError: beta or prior out of range, or a stream that never returns to any state.
     """
+    _check_model(model)
     part = model.problem(beta, prior_policy)
     solution = solve_problem(part.problem, model, prior_policy)
     policy = solution.policy.numpy()
@@ -188,6 +193,7 @@ def policy_uncertainty(model: EmpiricalMDP, policy: Any, beta: float, prior_poli
     Raises:
         InputError: a policy [S, A] that takes an action never tried (in a state of the empirical problem).
     """
+    _check_model(model)
     part = model.problem(beta, prior_policy)
     table = check_policy("policy", policy, model.n_states, model.n_actions)
     untried = (table > 0) & ~part.used & part.used.any(1, keepdims=True)
@@ -221,6 +227,7 @@ def bootstrap_theta(
     Raises:
         InputError: an argument out of range, or fewer than two samples that can be solved.
     """
+    _check_model(model)
     seed = checks.seed("seed", seed)
     checks.at_least("n_resamples", n_resamples, 2)
     rng = np.random.default_rng(seed)

@@ -16,6 +16,7 @@ import erl_torch
 from erl_torch import (
     AlgorithmS1,
     CertaintyEquivalence,
+    EfficientS1,
     InputError,
     Replicas,
     Simulation,
@@ -274,6 +275,12 @@ def test_numbers_of_numpy_count_as_python_s():
         (lambda other: AlgorithmS1().fit(other, 2, 2), "transitions"),
         (lambda other: erl_torch.empirical_mdp(other, 2, 2), "transitions"),
         (erl_torch.tabular_mdp, "env"),
+        (lambda other: erl_torch.theta_uncertainty(other, 1.0), "model"),
+        (lambda other: erl_torch.policy_uncertainty(other, POLICY, 1.0), "model"),
+        (lambda other: erl_torch.bootstrap_theta(other, 1.0), "model"),
+        (lambda other: next(EfficientS1().online(other, 2, 2)), "chunks?"),
+        (Replicas.of, "learner"),
+        (lambda other: Replicas([other]), "learners"),
     ],
 )
 def test_things_of_another_kind_are_named(call, key):
@@ -281,6 +288,24 @@ def test_things_of_another_kind_are_named(call, key):
         with pytest.raises(InputError, match=rf"^{key}=.* \((str|int|ndarray)\): must be ") as error:
             call(other)
         assert "\n" not in str(error.value)
+
+
+def test_what_has_a_length_but_no_room_is_refused_first():
+    columns = {name: [0] for name in ("s", "a", "s_next", "a_next")}
+    for n in (10**15, 10**25):
+        with pytest.raises(InputError, match=r"^r=array of shape \(\d+,\): must be smaller: .* GB are free$"):
+            Transitions(r=range(n), **columns)
+        with pytest.raises(InputError, match=r"^reward=array of shape \(2, \d+\): must be smaller: "):
+            TabularMDP(P, [range(n), range(n)])
+
+
+def test_parts_of_another_kind_are_named():
+    with pytest.raises(InputError, match=r"^chunk=.* \(ndarray\): must be Transitions$"):
+        list(EfficientS1().online([DATA, POLICY], 2, 2))
+    with pytest.raises(InputError, match=r"^n_replicas=.*: must be a whole number >= 1$"):
+        Replicas.of(AlgorithmS1(), sp.csr_array(TABLE), beta=[1.0, 2.0])
+    with pytest.raises(InputError, match=r"^learners=3 \(int\): must be a list$"):
+        Replicas(3)
 
 
 def test_a_model_of_other_sizes_and_a_prior_of_zero_are_named():

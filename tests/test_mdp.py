@@ -79,7 +79,15 @@ def changed(array, index, value):
             (changed(FLAT, (0, slice(None)), [1.5, -0.5, 0]), R),
             r"transition row 0 .*=-0.5: must be finite and >= 0",
         ),
-        ((FLAT[:5], R), r"transition=array of shape \(5, 3\): must be of shape \[6, 3\]"),
+        (
+            (FLAT[:5], R),
+            r"transition=array of shape \(5, 3\): must be of shape \[6, 3\] \(\[S\*A, S\]\) or "
+            r"\[3, 2, 3\] \(\[S, A, S\]\), as reward is \[3, 2\] \(\[S, A\]\): one of the two is wrong$",
+        ),
+        (
+            (sp.csr_array(FLAT[:5]), R),
+            r"transition=array of shape \(5, 3\): must be of shape \[6, 3\] \(\[S\*A, S\]\), as reward is \[3, 2\] ",
+        ),
         ((P, changed(R, (1, 0), np.inf)), r"reward\[1, 0\]=inf: must be finite"),
         ((P, changed(R, (1, 0), -1e300)), r"reward\[1, 0\]=-1e\+300: must be finite, and at most 1e\+100 in size"),
         ((P, R.ravel()), r"reward=array of shape \(6,\): must be of shape \[n_states, n_actions\]"),

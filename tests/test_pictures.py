@@ -65,3 +65,15 @@ def test_agent_is_drawn_where_it_stands():
     for cell in [(0, 0), (4, 1)]:
         change = np.argwhere((pictures.with_agent(board, GRID.shape, cell) != board).any(-1))
         np.testing.assert_allclose(change.mean(0), (np.array(cell) + 0.5) * 64 - 0.5, atol=1)
+
+
+def test_exact_values_of_settings_are_not_joined():
+    """They are known at the settings alone: between two of them nothing is drawn."""
+    one = {"mean": 1.0, "q25": 0.9, "q75": 1.1, "min": 0.0, "max": 2.0}
+    for markers in (True, False):
+        with_exact, without = (
+            pictures.bands({"y": [pictures.BandLine("a", [1, 2], [one] * 2, exact)]}, "x", "title", markers)
+            for exact in ([0.5, 0.5], [None, None])
+        )
+        changed = (with_exact != without).any((0, 2)).sum()  # columns of the picture, 450 between the two
+        assert 8 < changed < 40 if markers else changed > 200

@@ -212,7 +212,7 @@ def test_modules_are_imported_only_if_named_again(cliff, tmp_path, monkeypatch):
     policy = Solution.load(cliff / "solution.npz").policy
     run = copy(cliff, tmp_path / "run", policy, "env=gym", "env.id='mine:Mine-v0'", "env.name=mine")
     for module in ("null", "other"):
-        with pytest.raises(InputError, match=r"module=.*: must be mine, which makes the run's environment"):
+        with pytest.raises(InputError, match=r"module=.*: must be typed as module=mine: it makes"):
             play(arguments(f"run={run}", f"module={module}", "n_episodes=1"))
     assert "mine" not in sys.modules
     assert len(play(arguments(f"run={run}", "module=mine", "n_episodes=1", "render=none")).returns) == 1

@@ -27,6 +27,7 @@ from erl_torch import (
     Transitions,
     collect,
     kernels,
+    pictures,
     solve_soft_bellman,
 )
 from erl_torch.empirical import tally
@@ -455,11 +456,17 @@ def test_lines_of_optimum_and_prior(finished):
     assert gap.value == pytest.approx(group["exact"]["objective"] - group["objective"]["mean"], abs=1e-6)
 
 
-def test_settings_that_vary(tmp_path):
+def test_settings_that_vary(tmp_path, monkeypatch):
+    titles, draw = set(), pictures.bands
+    monkeypatch.setattr(
+        pictures, "bands", lambda panels, x, title, *a, **k: titles.add(title) or draw(panels, x, title, *a, **k)
+    )
     result = train(composed(*SMALL, "n_replicas=2", "++vary.beta=[5,10]", "++vary.lr_u=[0.01,0.02]"), tmp_path)
     assert [g["settings"] for g in result["groups"]] == [
         {"beta": b, "lr_u": lr} for b in (5, 10) for lr in (0.01, 0.02)
     ]
+    title = "windy_cliff, s1: 2 replicas of each setting"
+    assert titles == {title, f"{title}, at the end"}
     tags = events(tmp_path).Tags()
     assert "beta_5-lr_u_0.01/theta_mean" in tags["scalars"]
     assert {"bands/theta", "bands/objective", "sweep/theta", "sweep/delta_max"} < set(tags["images"])

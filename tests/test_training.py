@@ -430,6 +430,9 @@ def test_mdp_files_and_their_pictures(tmp_path):
     assert result["env"] == "mdp"
     with pytest.raises(InputError, match=r"env.path=nowhere.npz"):
         train(composed("env=mdp", "env.path=nowhere.npz"), tmp_path / "other")
+    np.save(tmp_path / "one.npy", np.eye(2))
+    with pytest.raises(InputError, match=r"env.path=\S*one.npy: must be a readable npz file .*is not a zip file\)$"):
+        train(composed("env=mdp", f"env.path={tmp_path}/one.npy"), tmp_path / "other")
 
 
 def test_wind_fields_come_from_a_file(tmp_path):

@@ -1,10 +1,12 @@
 """Transitions: validation, and files that never carry pickles or half a write."""
 
+import zipfile
+
 import numpy as np
 import pytest
 import torch
 
-from erl_torch import InputError, Transitions
+from erl_torch import InputError, Transitions, open_recording
 
 COLUMNS = {
     "s": [0, 1, 2],
@@ -73,6 +75,58 @@ def test_bad_files_are_named(tmp_path):
         with pytest.raises(InputError, match=name) as error:
             Transitions.load(tmp_path / name)
         assert "\n" not in str(error.value)
+
+
+def moved(whole, name):
+    """The header of one array eight bytes shorter: entries move by one, and eight bytes are left at the end."""
+    at = whole.find(b"\x93NUMPY", whole.find(f"{name}.npy".encode())) + 8
+    return whole[:at] + bytes([whole[at] - 8]) + whole[at + 1 :]
+
+
+def swallowed(whole, name):
+    """The directory's entry before that of one array takes the rest for its comment."""
+    entry = whole.rfind(b"PK\x01\x02", 0, whole.rfind(f"{name}.npy".encode()) - 46)
+    after = len(whole) - 22 - whole.find(b"PK\x01\x02", entry + 1)
+    return whole[: entry + 32] + after.to_bytes(2, "little") + whole[entry + 34 :]
+
+
+def renamed(whole, name):
+    """Another name in the directory alone."""
+    at = whole.rfind(f"{name}.npy".encode())
+    return whole[:at] + b"R" + whole[at + 1 :]
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (moved, "r.npy: Bad CRC-32"),
+        (swallowed, "7 members are announced, and 6 listed"),
+        (renamed, "R.npy: File name in directory"),
+    ],
+)
+def test_damage_that_leaves_arrays_readable_is_seen(tmp_path, damage, said):
+    rng = np.random.default_rng(0)
+    r, whole = rng.normal(size=4096), np.arange(4096) % 3
+    arrays = {"s": whole, "a": whole, "s_next": whole, "a_next": whole, "note": 1, "r": r, "more": 2}
+    np.savez(tmp_path / "good.npz", **arrays)
+    content = (tmp_path / "good.npz").read_bytes()
+    assert np.array_equal(Transitions.load(tmp_path / "good.npz").r, r)
+    name = {swallowed: "more"}.get(damage, "r")
+    (tmp_path / "bad.npz").write_bytes(damage(content, name))
+    with pytest.raises(InputError, match=rf"^path=\S*bad.npz: must be a readable npz file .*{said}"):
+        Transitions.load(tmp_path / "bad.npz")
+    with pytest.raises(InputError, match=r"bad\.npz"):
+        open_recording(tmp_path / "bad.npz", 3, 3)
+
+
+def test_an_array_is_in_a_file_once(tmp_path):
+    with zipfile.ZipFile(tmp_path / "twice.npz", "w") as archive:
+        for name in ("s.npy", "s"):
+            with archive.open(name, "w") as file:
+                np.save(file, np.arange(3))
+    for read in (Transitions.load, lambda path: open_recording(path, 3, 3)):
+        with pytest.raises(InputError, match=r"twice\.npz: must be .*\(s is there twice\)"):
+            read(tmp_path / "twice.npz")
 
 
 def test_pickles_are_refused(tmp_path):

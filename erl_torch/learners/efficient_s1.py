@@ -431,8 +431,10 @@ class EfficientS1:
             state: the last one of an earlier call, to go on from; None is the beginning.
 
         Raises:
-            InputError: a state or action out of range, or rewards whose squares are not finite.
+            InputError: chunks that are no Transitions, a state or action out of range, or rewards whose squares are not
+                finite.
         """
+        checks.instance("chunks", chunks, Iterable, "an iterable of Transitions, as of recording.chunks()")
         state = self.init_online(n_states, n_actions) if state is None else state
         for chunk in chunks:
             state = self.learn(state, chunk)
@@ -577,6 +579,7 @@ class EfficientS1:
 
         Pure: ``state`` is left as it is. Raises InputError as ``online`` does.
         """
+        checks.instance("chunk", chunk, Transitions, "Transitions")
         chunk.check_range(*state.log_z.shape)
         done = 0
         while done < len(chunk):

@@ -22,7 +22,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -185,9 +185,10 @@ class Replicas:
 
     def __post_init__(self) -> None:
         checks.plain(self)
-        object.__setattr__(self, "learners", tuple(self.learners))
+        object.__setattr__(self, "learners", checks.sequence("learners", self.learners))
         checks.at_least("n_replicas", len(self.learners), 1)
         for learner in self.learners:
+            _check_learner("learners", learner)
             if type(learner) is not type(self.learners[0]):
                 raise InputError("learners", type(learner).__name__, f"all {type(self.learners[0]).__name__}")
         if self.threads is not None:
@@ -212,6 +213,8 @@ class Replicas:
         **vectors: Iterable[float],
     ) -> Replicas:
         """``learner`` times ``n_replicas``; ``vectors`` give some of its arguments a value a replica, [R]."""
+        _check_learner("learner", learner)
+        n_replicas = None if n_replicas is None else checks.at_least("n_replicas", n_replicas, 1)
         names = {f.name for f in fields(learner)}
         columns = {name: checks.sequence(name, values) for name, values in vectors.items()}
         for name, column in columns.items():
@@ -222,7 +225,6 @@ class Replicas:
                 raise InputError(name, f"{len(column)} values", f"one for each of {n_replicas} replicas")
         if n_replicas is None:
             raise InputError("n_replicas", None, "given, or a vector of values")
-        n_replicas = checks.at_least("n_replicas", n_replicas, 1)
         own = [{name: _number(column[r]) for name, column in columns.items()} for r in range(n_replicas)]
         return cls(tuple(replace(learner, **values) for values in own), threads, block, layout, backend)
 
@@ -287,6 +289,11 @@ class Replicas:
         if isinstance(experience, Simulation) and experience.mdp.reward.shape != (n_states, n_actions):
             shape = experience.mdp.reward.shape
             raise InputError("experience", f"an MDP of shape {shape}", f"of shape {(n_states, n_actions)}")
+
+
+def _check_learner(key: str, learner: Any) -> None:
+    if not is_dataclass(learner) or isinstance(learner, type) or not hasattr(learner, "fit"):
+        raise InputError(key, f"{learner} ({type(learner).__name__})", "a learner that has fit, as AlgorithmS1()")
 
 
 def _number(value: Any) -> Any:
