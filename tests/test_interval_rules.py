@@ -61,17 +61,20 @@ def test_rewards_go_with_the_successor_that_a_row_moves_to():
 
 @pytest.mark.parametrize("reward", [1.0, -1.0])
 def test_a_row_hides_what_another_action_has_shown_on_either_side(reward):
-    """From state 0 action 1 leads to 1 in 10 of 100 draws, action 0 in none of 100; 1 pays and leads back. Each is
-    taken half the time. At one end h = P(1 | 0, action 0) is above 0, at a cost of -100 log(1 - h); at the other, 0."""
-    n, k = 100, 10
-    model = walk((n, 0, 0, 0.0, 0), (n - k, 0, 1, 0.0, 0), (k, 0, 1, 0.0, 1), *((k, 1, a, reward, 0) for a in (0, 1)))
+    """From state 0 action 1 leads to 1 in 10 of 100 draws, action 0 in none of 30; 1 pays and leads back. Each is taken
+    half the time. At one end h = P(1 | 0, action 0) is above 0, at a cost of -30 log(1 - h); at the other, 0."""
+    n, k, none = 100, 10, 30
+    model = walk(
+        (none, 0, 0, 0.0, 0), (n - k, 0, 1, 0.0, 0), (k, 0, 1, 0.0, 1), *((k, 1, a, reward, 0) for a in (0, 1))
+    )
 
     def rest(h, *between):
         """P(1 | 0, action 1) where the likelihood is spent, h being as it is."""
-        return brentq(lambda q: n * divergence(k / n, q) - n * np.log1p(-h) - BUDGET, *between)
+        return brentq(lambda q: n * divergence(k / n, q) - none * np.log1p(-h) - BUDGET, *between)
 
-    most = 1 - np.exp(-BUDGET / n)
+    most = 1 - np.exp(-BUDGET / none)
     far = -minimize_scalar(lambda h: -(h + rest(h, k / n, 0.9)), bounds=(0, most - 1e-9), method="bounded").fun
+    assert far > 1.05 * rest(0.0, k / n, 0.9)
     ends = [reward * q / (1 + q) for q in (rest(0.0, 1e-9, k / n) / 2, far / 2)]
     found = policy_uncertainty(model, np.full((2, 2), 0.5), 1.0)
     low, high = found.limits(BUDGET)
