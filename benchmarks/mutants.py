@@ -1852,6 +1852,27 @@ MUTANTS = [
         "diagonal",
         "test_solvers.py::test_superlu_in_an_order_of_its_own_solves_what_dense_algebra_solves",
     ),
+    Mutant(
+        "steps end at the first kink",
+        "uncertainty.py",
+        "policy, optimal, luck > 0)",
+        "policy, optimal, False)",
+        "test_interval_rules.py::test_the_low_end_of_the_best_of_equal_arms_is_where_all_are_low",
+    ),
+    Mutant(
+        "what half of the states lead to is common",
+        "uncertainty.py",
+        "> COMMON * problem.n_states",
+        ">= COMMON * problem.n_states",
+        "test_interval_rules.py::test_any_row_may_hide_what_is_met_from_most_states",
+    ),
+    Mutant(
+        "what most pairs lead to is common",
+        "uncertainty.py",
+        "row[p.data > 0] // n_actions]",
+        "row[p.data > 0]]",
+        "test_interval_rules.py::test_any_row_may_hide_what_is_met_from_most_states",
+    ),
 ]
 
 

@@ -95,6 +95,18 @@ def test_rows_with_a_single_draw_may_hide_any_state():
         np.testing.assert_allclose(wide.toarray(), model.transition.toarray())
 
 
+@pytest.mark.parametrize(("last", "hidden"), [(2, set()), (0, {0})])
+def test_any_row_may_hide_what_is_met_from_most_states(last, hidden):
+    """Two actions in each of four states, all alike. 1 and 2 may lead to 0, the state of most worth, and that is half of
+    the states; with 3, where the last leads there, it is most."""
+    pairs = ((0, 1), (1, 2), (1, 0), (2, 3), (2, 0), (3, last))
+    model = walk(*((10, s, a, 0.0, s_next) for s, s_next in pairs for a in (0, 1)))
+    part = model.problem(1.0)
+    wide, _ = _with_successor(model, part, uncertainty._rows(model, part, np.zeros(4)), -np.arange(4.0))
+    for row in (0, 1):  # both actions of 0
+        assert set(wide.indices[wide.indptr[row] : wide.indptr[row + 1]].tolist()) == {1} | hidden
+
+
 @pytest.mark.parametrize("bias", [0.3, -0.3])
 def test_the_second_order_moves_the_end_that_it_widens(monkeypatch, bias):
     """A bias of .3 half widths of J, known to .1: one end by both, the other by twice the error alone."""
@@ -193,3 +205,17 @@ def test_luck_is_of_arms_that_may_be_as_good(beta, behind, lucky):
     part, policy = model.problem(beta), np.array([[1.0, 0.0]])
     rows = uncertainty._rows(model, part, np.zeros(1))
     assert (_luck(part, _Worth(0.0, policy, np.zeros(1)), rows, policy) > 0) is lucky
+
+
+@pytest.mark.parametrize("n_arms", [2, 3, 5])
+def test_the_low_end_of_the_best_of_equal_arms_is_where_all_are_low(n_arms):
+    """One mean is 0, the others -.01, of 100 draws of variance 1 each; J is about the largest. It is down at L where all
+    are, which costs 50 sum (mean - L)^2. The steps come within a twentieth of L, from this side."""
+    beta, means = 1e6, np.append(0.0, np.full(n_arms - 1, -0.01))
+    model = arms(*(spread(100) + mean for mean in means))
+    part, policy = model.problem(beta), np.eye(n_arms)[:1]
+    luck = _luck(part, _Worth(0.0, policy, np.zeros(1)), uncertainty._rows(model, part, np.zeros(1)), policy)
+    level = brentq(lambda x: 50 * (np.maximum(means - x, 0) ** 2).sum() - BUDGET, -1, 0)
+    found = theta_uncertainty(model, beta)
+    assert found.bias == pytest.approx(0, abs=1e-9)
+    assert 0.95 * level > -found.limits(BUDGET)[1] + luck > 1.001 * level
