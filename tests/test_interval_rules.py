@@ -97,7 +97,7 @@ def test_rows_with_a_single_draw_may_hide_any_state():
 
 @pytest.mark.parametrize(("last", "hidden"), [(2, set()), (0, {0})])
 def test_any_row_may_hide_what_is_met_from_most_states(last, hidden):
-    """Two actions in each of four states, all alike. 1 and 2 may lead to 0, the state of most worth, and that is half of
+    """Two actions in each of four states, all alike. 1 and 2 may lead to 0, of most worth: half of
     the states; with 3, where the last leads there, it is most."""
     pairs = ((0, 1), (1, 2), (1, 0), (2, 3), (2, 0), (3, last))
     model = walk(*((10, s, a, 0.0, s_next) for s, s_next in pairs for a in (0, 1)))
@@ -209,7 +209,7 @@ def test_luck_is_of_arms_that_may_be_as_good(beta, behind, lucky):
 
 @pytest.mark.parametrize("n_arms", [2, 3, 5])
 def test_the_low_end_of_the_best_of_equal_arms_is_where_all_are_low(n_arms):
-    """One mean is 0, the others -.01, of 100 draws of variance 1 each; J is about the largest. It is down at L where all
+    """One mean is 0, the others -.01, of 100 draws of variance 1 each; J is about the largest. It is at L where all
     are, which costs 50 sum (mean - L)^2. The steps come within a twentieth of L, from this side."""
     beta, means = 1e6, np.append(0.0, np.full(n_arms - 1, -0.01))
     model = arms(*(spread(100) + mean for mean in means))
