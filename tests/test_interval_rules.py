@@ -97,8 +97,8 @@ def test_rows_with_a_single_draw_may_hide_any_state():
 
 @pytest.mark.parametrize(("last", "hidden"), [(2, set()), (0, {0})])
 def test_any_row_may_hide_what_is_met_from_most_states(last, hidden):
-    """Two actions in each of four states, all alike. 1 and 2 may lead to 0, of most worth: half of
-    the states; with 3, where the last leads there, it is most."""
+    """Two actions in each of four states, all alike. 1 and 2 may lead to 0, of most worth: half of the
+    states; with 3, where the last leads there, it is most."""
     pairs = ((0, 1), (1, 2), (1, 0), (2, 3), (2, 0), (3, last))
     model = walk(*((10, s, a, 0.0, s_next) for s, s_next in pairs for a in (0, 1)))
     part = model.problem(1.0)
