@@ -72,7 +72,7 @@ HALF = 0.5  # of the plug-in's standard error, that of resamples at least
 MAX_STEPS = 50
 PATIENCE = 10  # steps that gain nothing, where J has kinks
 FAR = 100.0  # logarithm of the price at which likelihood is given away
-CLOSE = 0.01  # part of the half width: an end of the interval is found where a step moves it by less
+CLOSE = 0.01  # part of the half width: an end is found where a step moves it by less (at kinks, a few hundredths)
 TIED = 2.0  # standard errors between two actions' values, up to which either may be the better
 COMMON = 0.5  # share of the states; a successor met from more of them may be met from any
 

@@ -195,3 +195,15 @@ def test_short_random_streams_have_the_theta_of_one_class_or_say_why_not():
             assert found.message
             assert part.reducible or len(ends) < len(p)
     assert {Status.CONVERGED, Status.REDUCIBLE} <= seen
+
+
+def test_an_answer_that_is_not_solved_says_what_is_proven():
+    """After one step; the optimum of the counts by value iteration."""
+    data = collect(CLIFF, 100, 1000, 0)
+    p, reward, _ = oracle.counted(data, 15, 4)
+    best, _ = oracle.soft_optimum(p, reward, np.full((15, 4), 0.25), 10.0)
+    found = CertaintyEquivalence(10.0, max_steps=1).fit(data, 15, 4)
+    assert found.status is Status.STEP_LIMIT
+    low, high = (float(x) for x in found.message.split("in the data, theta* in [")[1].rstrip("]").split(", "))
+    assert low <= -best <= high
+    assert high - low > 1e-3

@@ -2,6 +2,7 @@
 
 import copy
 from dataclasses import fields, replace
+from fractions import Fraction
 from itertools import pairwise
 
 import hypothesis
@@ -685,3 +686,43 @@ def test_a_fault_of_the_counts_is_not_taken_for_a_short_stream(monkeypatch):
     monkeypatch.setattr("erl_torch.empirical.EmpiricalMDP.problem", refuse)
     with pytest.raises(InputError, match="beta"):
         state.part()
+
+
+def test_theta_ends_within_the_certificate():
+    """After one pass over few tuples rho is near its start, exp(-beta): theta would be near 1. TV - V and T_pi V - V
+    by the oracle's backup, V = -log(psi)/beta."""
+    rng = np.random.default_rng(0)
+    mdp, prior, beta = random_mdp(rng, 4, 2), np.full((4, 2), 0.5), 3.0
+    data = random_stream(rng, mdp, 200)
+    p, reward, visits = oracle.counted(data, 4, 2)
+    assert visits.all()
+    found = EfficientS1(beta, n_epochs=1, n_bias=1).fit(data, 4, 2)
+    value, policy = -found.psi.log().numpy() / beta, found.policy.numpy()
+    high = (oracle.backup(p, reward, prior, beta, value)[0] - value).max()
+    low = ((policy * (reward + p @ value - np.log(policy / prior) / beta)).sum(1) - value).min()
+    assert low < high < -found.theta + 1 / 2
+    assert -high - 1e-9 <= found.theta <= -low + 1e-9
+
+
+def test_a_stream_of_two_closed_sets_is_reducible():
+    """theta is that of the one with more tuples: rewards -1, not -3."""
+    s = np.repeat([0, 1], [60, 40])
+    data = Transitions(s, 0 * s, np.where(s == 0, -1.0, -3.0), s, 0 * s)
+    found = EfficientS1(1.0).fit(data, 2, 1)
+    assert found.status is Status.REDUCIBLE
+    assert found.message.startswith("2 closed sets of states in this stream; solved on [0]")
+    assert found.theta == pytest.approx(1.0)
+
+
+def test_ends_of_the_certificate_are_beyond_what_fractions_say():
+    """One action, beta 1: T_pi V - V = TV - V = r + V(s') - V(s), to the last digit."""
+    rng, n = np.random.default_rng(0), 6
+    s, zero = np.arange(n), np.zeros(n, int)
+    for size in (1.0, 1e6):
+        reward, value = rng.normal(size=n), size * rng.normal(size=n)
+        stream = EfficientS1(1.0).prepare(Transitions(s, zero, reward, (s + 1) % n, zero), n, 1)
+        low, high = certificate(stream.part, -value, np.ones((n, 1)))
+        each = [Fraction(reward[i]) + Fraction(value[(i + 1) % n]) - Fraction(value[i]) for i in range(n)]
+        assert Fraction(low) <= min(each)
+        assert max(each) <= Fraction(high)
+        assert high - low == pytest.approx(float(max(each) - min(each)), rel=1e-9)

@@ -6,19 +6,22 @@ import math
 import warnings
 
 import numpy as np
+import oracle
 import pytest
 from conftest import random_mdp, random_policy
 from test_config import composed
 
 import erl_torch
 from erl_torch import NonFiniteError, TabularMDP, Transitions, collect
-from erl_torch.empirical import empirical_mdp
+from erl_torch.empirical import empirical_mdp, tally
 from erl_torch.envs.windy_cliff import WindyCliffEnv
 from erl_torch.learners import LEARNERS, EfficientS1
 from erl_torch.notes import collected, note
+from erl_torch.replicated import _reservations
 from erl_torch.reservations import (
     FAR,
     Reservation,
+    _covered,
     count,
     divergence,
     half_widths,
@@ -504,3 +507,43 @@ def test_theta_of_data_without_chance(theta, said):
     estimate = theta_uncertainty(empirical_mdp(Transitions(s, a, 1.0 * s, 1 - s, a), 2, 1), 1.0)
     assert estimate.withheld
     assert bool(of_theta(theta, (0.0, 1.0), estimate)) is said
+
+
+def test_half_widths_count_from_the_middle_of_a_lopsided_interval():
+    estimate = Estimate("theta", 1.0, 1.0, limits=lambda _: (0.0, 10.0))
+    assert [half_widths(theta, estimate) for theta in (0.0, 5.0, 10.0, -5.0)] == pytest.approx([1, 0, 1, 2])
+
+
+def test_theta_within_the_interval_at_the_level_of_notes_is_not_far():
+    """20 half widths off: of Student's distribution with one degree of freedom chance enough, of a normal one not."""
+    for freedom, found in ((1.0, 0), (np.inf, 1)):
+        estimate = Estimate("theta", 0.0, 1.0, freedom=freedom)
+        _, half = estimate.interval()
+        assert len(of_theta(20 * half, (-1e3, 1e3), estimate)) == found
+
+
+def test_theta_out_of_range_by_rounding_is_not_out_of_range():
+    assert of_theta(1 + 1e-8, (-1.0, 0.0)) == of_theta(-1e-8, (-1.0, 0.0)) == []
+    assert [found.kind for found in of_theta(1.01, (-1.0, 0.0))] == ["theta out of range"]
+
+
+def test_data_without_a_state_that_theirs_lead_to_are_not_of_the_models_theta():
+    """0 leads to 1 in one of ten steps, which five tuples do not show."""
+    mdp = TabularMDP(np.array([[[0.9, 0.1]], [[1.0, 0.0]]]), np.zeros((2, 1)))
+    zero = np.zeros(5, int)
+    short = Transitions(zero, zero, np.zeros(5), zero, zero)
+    back = Transitions(np.append(zero, 1), np.zeros(6, int), np.zeros(6), np.zeros(6, int), np.zeros(6, int))
+    assert not _covered(tally(short, 2, 1), mdp)
+    assert _covered(tally(back, 2, 1), mdp)
+
+
+def test_each_replica_of_a_seed_is_held_against_the_data_at_its_own_beta():
+    """The optimum of the counts by value iteration, at each beta."""
+    rng = np.random.default_rng(0)
+    mdp, prior = random_mdp(rng, 3, 2), np.full((3, 2), 0.5)
+    experience, betas = erl_torch.Simulation(mdp, 5, 200, [7, 7, 8]), (0.5, 5.0, 5.0)
+    _, held = _reservations(experience, [EfficientS1(beta) for beta in betas], prior, None, True, lambda: None)
+    for r, beta in enumerate(betas):
+        p, reward, _ = oracle.counted(experience.stream(r, prior), 3, 2)
+        best, _ = oracle.soft_optimum(p, reward, prior, beta)
+        assert held[r].estimate.value + held[r].estimate.bias == pytest.approx(-best, abs=1e-8)

@@ -19,7 +19,9 @@ from erl_torch import (
     Status,
     TabularMDP,
     certify,
+    chains,
     iterate_biasing,
+    kernels,
     perron,
     solve_biasing,
     solve_soft_bellman,
@@ -28,6 +30,8 @@ from erl_torch.chains import RegenerativeLU, SingularChainError, classes, reacha
 from erl_torch.envs.windy_cliff import WindyCliffEnv
 from erl_torch.evaluation import induced_distribution, kl_per_state, objective, policy_chain, reward_per_step
 from erl_torch.learners import Exact
+from erl_torch.solvers import eigenpair
+from erl_torch.solvers.eigenpair import REFUSALS
 from erl_torch.solvers.problem import Problem
 
 CLIFF = WindyCliffEnv().mdp
@@ -514,3 +518,60 @@ def test_problem_restricts_to_what_the_start_leads_to():
     problem = Problem.of(two_ends(), 1.0)
     assert problem.n_states == 3
     assert Problem.of(TabularMDP(two_ends().transition, two_ends().reward, [0, 1, 0]), 1.0).states.tolist() == [1]
+
+
+@pytest.mark.parametrize("refusals", [1, REFUSALS, REFUSALS + 1])
+def test_perron_goes_on_after_a_chain_that_falls_apart(monkeypatch, refusals):
+    """With a power step each time; in any case the bounds hold the root that numpy finds."""
+    matrix = np.random.default_rng(0).random((5, 5)) + 0.1
+    root = np.log(np.abs(np.linalg.eigvals(matrix)).max())
+    monkeypatch.setattr(eigenpair, "STEPS_AFTER_A_REFUSAL", 1)
+    monkeypatch.setattr(eigenpair, "POWER_STEPS", 0)
+    adapted, met = RegenerativeLU.adapted, []
+
+    def refuse(*arguments):
+        met.append(arguments)
+        if len(met) <= refusals:
+            raise SingularChainError
+        return adapted(*arguments)
+
+    monkeypatch.setattr(RegenerativeLU, "adapted", refuse)
+    found = perron(matrix)
+    assert len(met) >= refusals
+    assert found.status is (Status.CONVERGED if refusals <= REFUSALS else Status.STAGNATED)
+    assert found.bounds[0] - 1e-14 <= root <= found.bounds[1] + 1e-14
+
+
+def test_gains_that_are_no_numbers_bound_nothing():
+    point = eigenpair._Point(np.zeros(2), np.array([0.5, np.nan]), sp.csr_array(np.eye(2)))
+    assert point.bounds(2) == (-np.inf, np.inf)
+
+
+def test_power_steps_are_not_caught_by_a_period():
+    """M = [[0, a], [b, 0]]: the root is sqrt(ab), y(0)/y(1) = sqrt(a/b). M^2 is a multiple of I: plain steps go to and
+    fro for ever."""
+    a, b = 3.0, 0.2
+    h, gain, chain = np.zeros(2), np.empty(2), np.empty(2)
+    ptr, ind = np.array([0, 1, 2]), np.array([1, 0], np.int32)
+    low, high = kernels.lazy_log_steps(ptr, ind, np.log([a, b]), h, gain, chain, 200, 1e-12)
+    assert (low, high) == pytest.approx((np.log(a * b) / 2,) * 2, abs=1e-11)
+    assert h[0] - h[1] == pytest.approx(np.log(a / b) / 2, abs=1e-11)
+
+
+@pytest.mark.parametrize("n", [3, 40])
+def test_superlu_in_an_order_of_its_own_solves_what_dense_algebra_solves(monkeypatch, n):
+    """States that are left at rates of their own, in an order of elimination that is not theirs."""
+    monkeypatch.setattr(chains, "MAX_OPERATIONS", -1)
+    rng = np.random.default_rng(n)
+    chain = np.roll(np.eye(n), 1, axis=1) + (rng.random((n, n)) < 2 / n) * rng.random((n, n))
+    chain = chain / chain.sum(1, keepdims=True)
+    chain += np.diag(rng.uniform(0, 20, n))
+    chain = chain / chain.sum(1, keepdims=True)
+    lu, c = RegenerativeLU(sp.csr_array(chain), 1), rng.standard_normal(n)
+    assert not lu.elimination.fits
+    assert n == 3 or (lu.elimination.rank != np.arange(n)).any()
+    d = oracle.stationary(chain)
+    np.testing.assert_allclose(lu.stationary(), d, rtol=1e-9)
+    gain, w = lu.poisson(c, refine=False)
+    assert gain == pytest.approx(d @ c, abs=1e-11)
+    np.testing.assert_allclose(w + gain, c + chain @ w, atol=1e-10)
