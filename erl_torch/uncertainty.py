@@ -139,7 +139,7 @@ class Estimate:
             low, high = np.floor(low / unit) * unit, np.ceil(high / unit) * unit
             return f"{self.name} = {self.value:.{digits}f} in [{low:.{digits}f}, {high:.{digits}f}]"
         shown = float(f"{self.value:.{digits}f}")
-        half = max(np.ceil(max(high - shown, shown - low) / unit - 1e-9), 0.0) * unit
+        half = max(0.0, np.ceil(max(high - shown, shown - low) / unit - 1e-9)) * unit
         return f"{self.name} = {self.value:.{digits}f} +- {half:.{digits}f}"
 
 
