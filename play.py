@@ -11,15 +11,16 @@ from pathlib import Path
 import hydra
 from omegaconf import DictConfig
 
-from erl_torch import cli, config
+from erl_torch.cli import main as cli
+from erl_torch.run import settings as schemas
 
-config.register()
+schemas.register()
 
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="play")
 def main(cfg: DictConfig) -> None:
     # Imported here: torch takes seconds, and --help and Tab completion do not need it.
-    from erl_torch.playing import play
+    from erl_torch.run.playing import play
 
     try:
         play(cfg)

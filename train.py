@@ -15,16 +15,17 @@ from typing import Any
 import hydra
 from omegaconf import DictConfig
 
-from erl_torch import cli, config
+from erl_torch.cli import main as cli
+from erl_torch.run import settings as schemas
 
-config.register()
+schemas.register()
 
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="train")
 @cli.job
 def main(cfg: DictConfig, directory: Path, safe_point: Callable[[], None]) -> Any:
     # Imported here: torch takes seconds, and --help and Tab completion do not need it.
-    from erl_torch.training import train
+    from erl_torch.run.training import train
 
     return train(cfg, directory, safe_point)["objective"]
 

@@ -22,7 +22,7 @@ from erl_torch import CertaintyEquivalence, EfficientS1, collect, solve_soft_bel
 from erl_torch.envs.windy_cliff import WindyCliffEnv
 from erl_torch.evaluation import kl_per_state, objective
 from erl_torch.files import write_json
-from erl_torch.learners.efficient_s1 import SWITCHES
+from erl_torch.learners.efficient_s1.algorithm import SWITCHES
 
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
 BETA = 10.0

@@ -37,7 +37,7 @@ from mpmath import mp, mpf  # noqa: E402
 from erl_torch import InputError, TabularMDP, certify, evaluation, solve_biasing, solve_soft_bellman  # noqa: E402
 
 try:
-    from erl_torch import certificates
+    from erl_torch.mdp import certificates
 except ImportError:  # an earlier package
     certificates = None  # type: ignore[assignment]
 

@@ -34,9 +34,9 @@ from matplotlib.figure import Figure
 
 from erl_torch import AlgorithmS1, CertaintyEquivalence, EfficientS1, Replicas, Simulation, TabularMDP, collect, kernels
 from erl_torch.envs.windy_cliff import WindyCliffEnv
-from erl_torch.learners.s1_lanes import ROWS, Engine, Lanes
+from erl_torch.experience.sampling import Sampler
+from erl_torch.learners.s1.lanes import ROWS, Engine, Lanes
 from erl_torch.rng import streams
-from erl_torch.sampling import Sampler
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "docs" / "results"

@@ -26,12 +26,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from erl_torch import AlgorithmS1, CertaintyEquivalence, EfficientS1, Transitions, collect, kernels, reservations
+from erl_torch import AlgorithmS1, CertaintyEquivalence, EfficientS1, Transitions, collect, kernels
+from erl_torch.empirical import reservations
 from erl_torch.envs.windy_cliff import WindyCliffEnv
-from erl_torch.learners import listing
-from erl_torch.learners.algorithm_s1 import S1Stream
-from erl_torch.recordings import ColumnWriter, open_recording
-from erl_torch.transitions import Recording
+from erl_torch.experience.recording import ColumnWriter, open_recording
+from erl_torch.experience.transitions import Recording
+from erl_torch.learners.s1 import listing
+from erl_torch.learners.s1.algorithm import S1Stream
 
 ROOT = Path(__file__).parents[1]
 LR_U, LR_RHO, BETA = 0.005, 0.005 / 15, 10.0

@@ -13,24 +13,24 @@ import erl_torch.envs  # noqa: F401  (registers the environments)
 
 if TYPE_CHECKING:
     from erl_torch.checks import InputError
-    from erl_torch.empirical import EmpiricalMDP, empirical_mdp
+    from erl_torch.empirical.counts import EmpiricalMDP, empirical_mdp
+    from erl_torch.empirical.uncertainty import Estimate, bootstrap_theta, policy_uncertainty, theta_uncertainty
     from erl_torch.envs.estimate import EstimatedModel, estimate_mdp
-    from erl_torch.envs.rollout import collect_rollouts, rollout
     from erl_torch.evaluation import Evaluation, evaluate
-    from erl_torch.experience import collect, record
-    from erl_torch.learners.algorithm_s1 import AlgorithmS1, ListedS1, S1State
+    from erl_torch.experience.collect import collect, record
+    from erl_torch.experience.recording import FileRecording, open_recording, save_columns
+    from erl_torch.experience.rollouts import collect_rollouts, rollout
+    from erl_torch.experience.transitions import Recording, Transitions
     from erl_torch.learners.certainty_equivalence import CertaintyEquivalence
-    from erl_torch.learners.efficient_s1 import EfficientS1
-    from erl_torch.learners.fitting import NonFiniteError
+    from erl_torch.learners.efficient_s1.algorithm import EfficientS1
+    from erl_torch.learners.learner import NonFiniteError
     from erl_torch.learners.replicas import Replicas, ReplicaSolution, Simulation
-    from erl_torch.mdp import TabularMDP
-    from erl_torch.models import MeanRewardWarning, tabular_mdp
+    from erl_torch.learners.s1.algorithm import AlgorithmS1, ListedS1, S1State
+    from erl_torch.mdp.from_gymnasium import MeanRewardWarning, tabular_mdp
+    from erl_torch.mdp.tabular import TabularMDP
     from erl_torch.notes import Note
-    from erl_torch.recordings import FileRecording, open_recording, save_columns
     from erl_torch.solution import Solution, Status
     from erl_torch.solvers import certify, iterate_biasing, perron, solve_biasing, solve_soft_bellman
-    from erl_torch.transitions import Recording, Transitions
-    from erl_torch.uncertainty import Estimate, bootstrap_theta, policy_uncertainty, theta_uncertainty
 
 __version__ = "0.1.0"
 

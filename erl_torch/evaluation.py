@@ -13,15 +13,16 @@ import gymnasium as gym
 import numpy as np
 import scipy.sparse as sp
 
-from erl_torch import certificates, chains, checks, kernels
-from erl_torch.certificates import one_step_worth, policy_gains
-from erl_torch.chains import GTH_STATES, classes, long_run
+from erl_torch import checks, kernels
 from erl_torch.checks import InputError
-from erl_torch.experience import batched, reset
-from erl_torch.mdp import TabularMDP, check_policy, check_prior
-from erl_torch.models import known_mdp, sizes
+from erl_torch.experience.collect import batched, reset
+from erl_torch.experience.sampling import policy_cdf, sampling_tables
+from erl_torch.mdp import certificates, chains
+from erl_torch.mdp.certificates import one_step_worth, policy_gains
+from erl_torch.mdp.chains import GTH_STATES, classes, long_run
+from erl_torch.mdp.from_gymnasium import known_mdp, sizes
+from erl_torch.mdp.tabular import TabularMDP, check_policy, check_prior
 from erl_torch.rng import Streams
-from erl_torch.sampling import policy_cdf, sampling_tables
 
 
 class Evaluation(NamedTuple):
@@ -63,7 +64,7 @@ def stationary_distribution(transition: sp.csr_array, start: np.ndarray) -> np.n
     """Long-run share of time in each state, from ``start`` [S]; chain as CSR [S, S].
 
     Periodic chains and chains with several closed classes are fine: each class counts by the probability
-    of ending in it. No digit is lost where the chain rarely moves between its parts (``erl_torch.chains``).
+    of ending in it. No digit is lost where the chain rarely moves between its parts (``erl_torch.mdp.chains``).
     """
     return long_run(transition, start).of_state
 

@@ -17,7 +17,7 @@ import torch
 from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.files import read_npz, write_npz
-from erl_torch.mdp import check_policy
+from erl_torch.mdp.tabular import check_policy
 
 NO_NAN: checks.Entries = (lambda x: ~np.isnan(x), "a number")
 
@@ -54,7 +54,7 @@ def _rounded(x: float, digits: int, way: str) -> str:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Solution:
-    """A policy with the tables and the record behind it (symbols as in ``erl_torch.learners.algorithm_s1``).
+    """A policy with the tables and the record behind it (symbols as in ``erl_torch.learners.s1.algorithm``).
 
     ``history`` has one array a logged quantity, one entry an epoch. theta and rho are None where the learner
     estimates neither (discounted learners); bounds, gap and k where they are not known.

@@ -6,7 +6,7 @@ import torch
 
 import erl_torch
 from erl_torch.envs.windy_cliff import WindyCliffEnv
-from erl_torch.learners.fitting import epochs, run_to_end
+from erl_torch.learners.learner import epochs, run_to_end
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,10 @@ from conftest import problems, random_stream
 from hypothesis import strategies as st
 
 from erl_torch import InputError, Status, TabularMDP, Transitions, collect, kernels, solve_soft_bellman
-from erl_torch.chains import RegenerativeLU
-from erl_torch.comparison import measure, optimum
 from erl_torch.envs.windy_cliff import WindyCliffEnv
 from erl_torch.learners import LEARNERS, DifferentialSoftQ, QLearning, RVISoftQ, Sarsa, SoftQ, ULearning, ZLearning
+from erl_torch.mdp.chains import RegenerativeLU
+from erl_torch.run.comparison import measure, optimum
 
 AVERAGE = (DifferentialSoftQ, RVISoftQ)
 OPTIMISTIC = (ULearning, ZLearning)

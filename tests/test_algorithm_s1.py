@@ -12,7 +12,7 @@ from conftest import overshooting, problems, random_mdp, random_policy, random_s
 from hypothesis import strategies as st
 
 from erl_torch import AlgorithmS1, InputError, ListedS1, NonFiniteError, Solution, Status, Transitions, collect, kernels
-from erl_torch.empirical import tally
+from erl_torch.empirical.counts import tally
 from erl_torch.envs.windy_cliff import WindyCliffEnv
 
 IMPLEMENTATIONS = ("fast", "literal")
@@ -110,7 +110,7 @@ def test_fast_is_the_listing_on_the_cliff(authors_tuples):
 
 def test_literal_walks_torch_tables_as_it_walks_views(authors_tuples):
     """On a device without NumPy views the listing indexes torch tensors: same doubles."""
-    from erl_torch.learners import listing
+    from erl_torch.learners.s1 import listing
 
     few = Transitions(*(getattr(authors_tuples, n)[:400] for n in ("s", "a", "r", "s_next", "a_next")))
     settings = dict(

@@ -18,10 +18,11 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensorboard.plugins.hparams import plugin_data_pb2
 from test_config import composed
 
-from erl_torch import NonFiniteError, board, solve_soft_bellman
+from erl_torch import NonFiniteError, solve_soft_bellman
 from erl_torch.envs.windy_cliff import WindyCliffEnv
+from erl_torch.log import tensorboard as board
+from erl_torch.run.training import train, where
 from erl_torch.solvers import certify
-from erl_torch.training import train, where
 
 PAGE = (Path(__file__).parents[1] / "docs" / "logging.md").read_text()
 DOCUMENTED = set(re.findall(r"`([\w/]+)`", PAGE))

@@ -12,10 +12,10 @@ from test_config import composed
 from test_training import events
 
 from erl_torch import AlgorithmS1, InputError, NonFiniteError, Replicas, Simulation, Solution, Status, collect
-from erl_torch.checkpoint import Checkpoints, decode, encode
-from erl_torch.event_file import EventFile
 from erl_torch.learners import LEARNERS
-from erl_torch.training import train
+from erl_torch.log.event_file import EventFile
+from erl_torch.run.checkpoint import Checkpoints, decode, encode
+from erl_torch.run.training import train
 
 SMALL = (
     "experience.n_episodes=3",
@@ -172,7 +172,7 @@ def test_checkpoints_know_their_settings(tmp_path, cut):
 
 def test_checkpoints_of_another_version_stay(cut, monkeypatch):
     cfg, directory, _ = cut
-    monkeypatch.setattr("erl_torch.checkpoint.FORMAT", 3)
+    monkeypatch.setattr("erl_torch.run.checkpoint.FORMAT", 3)
     before = files(directory)
     with pytest.raises(
         InputError, match=r"checkpoint=.*12000.ckpt: must be of this version \(it is of format 2, not 3"
@@ -276,8 +276,10 @@ def test_any_error_keeps_what_was_learnt(tmp_path, monkeypatch, error, place, re
     module = "replicated" if replicas else "training"
     target, name = {
         "learner": (AlgorithmS1, "step") if not replicas else (Replicas, "iterate"),
-        "evaluation": (f"erl_torch.{module}._Judges", "__call__") if replicas else ("erl_torch.training", "evaluate"),
-        "log": ("erl_torch.board.Board", "scalars"),
+        "evaluation": (f"erl_torch.{module}._Judges", "__call__")
+        if replicas
+        else ("erl_torch.run.training", "evaluate"),
+        "log": ("erl_torch.log.tensorboard.Board", "scalars"),
     }[place]
     if isinstance(target, str):
         target = pydoc.locate(target)
@@ -319,7 +321,7 @@ def test_an_error_after_the_learning_keeps_it(tmp_path, monkeypatch):
     def failing(*_):
         raise MemoryError
 
-    monkeypatch.setattr("erl_torch.training.certify", failing)
+    monkeypatch.setattr("erl_torch.run.training.certify", failing)
     with pytest.raises(MemoryError):
         train(composed(*SMALL, *SHORT["s1"]), tmp_path)
     assert json.loads((tmp_path / "result.json").read_text())["status"] == "completed"
@@ -330,7 +332,7 @@ def test_a_certificate_beyond_memory_is_named(tmp_path, monkeypatch):
     def failing(*_):
         raise MemoryError("SuperLU: not enough memory")
 
-    monkeypatch.setattr("erl_torch.training.solve_soft_bellman", failing)
+    monkeypatch.setattr("erl_torch.run.training.solve_soft_bellman", failing)
     with pytest.raises(
         InputError, match=r"^evaluation.certify=true: must be false: .* needs more memory than there is"
     ):
@@ -362,7 +364,7 @@ def test_a_complete_run_is_not_repeated(tmp_path, capsys):
 
 def test_interval(tmp_path, monkeypatch):
     now = [0.0]
-    monkeypatch.setattr("erl_torch.checkpoint.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("erl_torch.run.checkpoint.time.monotonic", lambda: now[0])
     saved = Checkpoints(tmp_path, {}, 10.0)
     for step, at in enumerate((9.9, 10.0, 15.0, 20.1)):
         now[0] = at

@@ -12,13 +12,15 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from erl_torch import InputError, checks, cli, config
+from erl_torch import InputError, checks
 from erl_torch.checks import InputError as ChecksInputError
+from erl_torch.cli import main as cli
 from erl_torch.learners import LEARNERS, AlgorithmS1, ListedS1
-from erl_torch.training import make_learner, train
+from erl_torch.run import settings as schemas
+from erl_torch.run.training import make_learner, train
 
 CONF = Path(__file__).parents[1] / "conf"
-config.register()
+schemas.register()
 
 
 def composed(*overrides):
@@ -52,7 +54,7 @@ def test_defaults_are_figure_5s(authors):
 
 @pytest.mark.parametrize("name", sorted(LEARNERS))
 def test_schema_is_the_learners_signature(name):
-    schema = {f.name: f.default for f in fields(config.SCHEMAS["learner"][name])}
+    schema = {f.name: f.default for f in fields(schemas.SCHEMAS["learner"][name])}
     learner = {f.name: f.default for f in fields(LEARNERS[name])}
     assert schema.pop("name") == name
     assert schema == learner
@@ -73,16 +75,16 @@ def test_every_key_is_explained(path):
 def presets(group):
     """Files that only set keys of another one of their group."""
     paths = (CONF / group).glob("*.yaml")
-    return {path.stem for path in paths if OmegaConf.load(path).defaults[0] in config.SCHEMAS[group]}
+    return {path.stem for path in paths if OmegaConf.load(path).defaults[0] in schemas.SCHEMAS[group]}
 
 
-@pytest.mark.parametrize("group", sorted(config.SCHEMAS))
+@pytest.mark.parametrize("group", sorted(schemas.SCHEMAS))
 def test_every_schema_has_its_yaml(group):
     stems = {p.stem for p in (CONF / group).glob("*.yaml")}
-    assert stems - presets(group) == set(config.SCHEMAS[group])
+    assert stems - presets(group) == set(schemas.SCHEMAS[group])
     for stem in stems - presets(group):
         keys = set(OmegaConf.load(CONF / group / f"{stem}.yaml")) - {"defaults"}
-        assert keys == {f.name for f in fields(config.SCHEMAS[group][stem])}
+        assert keys == {f.name for f in fields(schemas.SCHEMAS[group][stem])}
 
 
 @pytest.mark.parametrize("path", sorted((CONF / "env").glob("*.yaml")), ids=lambda path: path.stem)
@@ -91,7 +93,7 @@ def test_environments_compose_and_suggest_a_beta(path):
     cfg = composed(f"env={path.stem}", *needed.get(path.stem, []))
     assert cfg.learner.beta == cfg.env.suggest.beta > 0
     assert composed("learner=exact", f"env={path.stem}", "learner.beta=3").learner.beta == 3
-    config.check_keys(cfg)
+    schemas.check_keys(cfg)
 
 
 NAN, INF = float("nan"), float("inf")
@@ -221,7 +223,7 @@ def test_want_of_memory_is_one_line(message, expected):
         assert re.fullmatch(r"memory: not enough \(.*\)", cli._line(message))
 
 
-@pytest.mark.parametrize("group", ["", *(f"{g}." for g in config.SCHEMAS)])
+@pytest.mark.parametrize("group", ["", *(f"{g}." for g in schemas.SCHEMAS)])
 @pytest.mark.parametrize("plus", ["", "+"])
 def test_unknown_keys_get_one_line(tmp_path, group, plus):
     line = complaint(tmp_path, f"{plus}{group}abcxyz=2")
@@ -261,12 +263,12 @@ def test_other_complaints(tmp_path, overrides, expected):
 
 
 def test_run_names():
-    assert config.run_name(3, "learner.beta=2,seed=0") == "003-beta=2-seed=0"
-    assert config.run_name(0, "") == "000-run"
-    assert config.run_name(12, "+env.kwargs.desc=[a/b c],learner=s1") == "012-desc=-a-b-c-learner=s1"
-    assert len(config.run_name(1, "x=" + "y" * 500)) == 80
-    assert "/" not in config.slug("../../a b/c")
-    assert config.slug("") == "run"
+    assert schemas.run_name(3, "learner.beta=2,seed=0") == "003-beta=2-seed=0"
+    assert schemas.run_name(0, "") == "000-run"
+    assert schemas.run_name(12, "+env.kwargs.desc=[a/b c],learner=s1") == "012-desc=-a-b-c-learner=s1"
+    assert len(schemas.run_name(1, "x=" + "y" * 500)) == 80
+    assert "/" not in schemas.slug("../../a b/c")
+    assert schemas.slug("") == "run"
 
 
 def test_input_errors_are_value_errors_on_one_line():

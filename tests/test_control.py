@@ -14,7 +14,7 @@ import erl_torch
 from erl_torch import InputError, collect_rollouts, estimate_mdp, rollout, solve_soft_bellman
 from erl_torch.envs import CONTROL_ENTRY_POINTS, CONTROL_EPISODE_LENGTH, CONTROL_TASKS, estimate
 from erl_torch.envs.control import control_task
-from erl_torch.envs.rollout import _Player
+from erl_torch.experience.rollouts import _Player
 
 IDS = sorted(CONTROL_ENTRY_POINTS)
 # The reward that the paper's model pays, of a step that Gymnasium made: (the original after it, its reward).

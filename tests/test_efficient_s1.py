@@ -31,10 +31,10 @@ from erl_torch import (
 )
 from erl_torch.envs.windy_cliff import WindyCliffEnv
 from erl_torch.evaluation import kl_per_state, objective
-from erl_torch.learners import listing
-from erl_torch.learners.efficient_s1 import SWITCHES, certificate, swept
+from erl_torch.experience.transitions import COLUMNS
+from erl_torch.learners.efficient_s1.algorithm import SWITCHES, certificate, swept
+from erl_torch.learners.s1 import listing
 from erl_torch.solvers.problem import Problem
-from erl_torch.transitions import COLUMNS
 
 CLIFF = WindyCliffEnv().mdp
 UNIFORM = np.full((15, 4), 0.25)
@@ -683,7 +683,7 @@ def test_a_fault_of_the_counts_is_not_taken_for_a_short_stream(monkeypatch):
     def refuse(*_):
         raise InputError("beta", 1, "another")
 
-    monkeypatch.setattr("erl_torch.empirical.EmpiricalMDP.problem", refuse)
+    monkeypatch.setattr("erl_torch.empirical.counts.EmpiricalMDP.problem", refuse)
     with pytest.raises(InputError, match="beta"):
         state.part()
 

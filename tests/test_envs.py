@@ -19,7 +19,7 @@ from erl_torch.envs.shift import dynamics_shift
 from erl_torch.envs.tabular import TabularEnv
 from erl_torch.envs.windy_cliff import WindyCliffEnv
 from erl_torch.evaluation import reward_per_step
-from erl_torch.models import sizes
+from erl_torch.mdp.from_gymnasium import sizes
 
 IDS = sorted(ENTRY_POINTS)
 MODELS = [env_id for env_id in IDS if env_id not in CONTROL_ENTRY_POINTS]  # the others: test_control.py

@@ -69,7 +69,7 @@ def test_law_of_the_stream(known, on_prior):
 def test_blocks_do_not_show(monkeypatch):
     mdp = WindyCliffEnv().mdp
     whole = collect(mdp, 50, 100, 1)
-    monkeypatch.setattr("erl_torch.experience.BLOCK", 730)
+    monkeypatch.setattr("erl_torch.experience.collect.BLOCK", 730)
     seen = []
     parts = collect(mdp, 50, 100, 1, report=seen.append)
     assert seen == [*range(730, 5000, 730), 5000]

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from erl_torch import TabularMDP, Transitions, kernels
-from erl_torch.empirical import tally
+from erl_torch.empirical.counts import tally
 from erl_torch.evaluation import Judge, reward_per_step
-from erl_torch.sampling import _levels, _words, policy_cdf, sampling_tables
+from erl_torch.experience.sampling import _levels, _words, policy_cdf, sampling_tables
 
 BELOW_1 = math.nextafter(1.0, 0.0)
 

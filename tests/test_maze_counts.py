@@ -13,7 +13,7 @@ from erl_torch.reproduction import figure_s1, table_s1
 from erl_torch.reproduction.artifact import NOT_REPRODUCED, REPRODUCED
 from erl_torch.reproduction.mazes import MAX_ITERATIONS, count_by_power_iteration, count_cell
 from erl_torch.solvers.biasing import iterate_biasing
-from erl_torch.solvers.compiled import NewtonPattern
+from erl_torch.solvers.newton import NewtonPattern
 from erl_torch.solvers.problem import Problem
 
 
@@ -36,7 +36,7 @@ def one_maze(size, density, wind_level, seed, i):
 def test_compiled_eigenvectors_are_the_general_ones(cell, beta, monkeypatch):
     mdp = one_maze(*cell)
     compiled = solve_biasing(mdp, beta, stop="kl")
-    monkeypatch.setattr("erl_torch.chains.SPARSE_STATES", 0)
+    monkeypatch.setattr("erl_torch.mdp.chains.SPARSE_STATES", 0)
     general = solve_biasing(mdp, beta, stop="kl")
     assert compiled.k == general.k
     assert compiled.theta == pytest.approx(general.theta, abs=1e-12)

@@ -8,7 +8,7 @@ import scipy.sparse as sp
 import torch
 
 from erl_torch import InputError, Note, TabularMDP
-from erl_torch.mdp import check_policy, check_prior, normalise_rows
+from erl_torch.mdp.tabular import check_policy, check_prior, normalise_rows
 
 P = np.array([[[0.5, 0.5, 0.0], [0.0, 0.0, 1.0]]] * 3)  # [S, A, S] = [3, 2, 3]
 FLAT = P.reshape(6, 3)

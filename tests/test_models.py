@@ -10,7 +10,7 @@ from conftest import random_mdp
 import erl_torch
 from erl_torch import InputError, MeanRewardWarning, TabularMDP, tabular_mdp
 from erl_torch.envs.tabular import TabularEnv
-from erl_torch.models import known_mdp
+from erl_torch.mdp.from_gymnasium import known_mdp
 
 TOYS = ["FrozenLake-v1", "CliffWalking-v1", "Taxi-v4"]
 

@@ -30,13 +30,13 @@ from erl_torch import (
     pictures,
     solve_soft_bellman,
 )
-from erl_torch.empirical import tally
+from erl_torch.empirical.counts import tally
 from erl_torch.evaluation import Judge, objective, reward_per_step
+from erl_torch.experience.sampling import Sampler
 from erl_torch.learners import LEARNERS
 from erl_torch.learners.replicas import tuples_of
 from erl_torch.rng import streams
-from erl_torch.sampling import Sampler
-from erl_torch.training import train
+from erl_torch.run.training import train
 
 ROOT = Path(__file__).parents[1]
 N = 7  # replicas
@@ -174,7 +174,7 @@ def test_torch_operations_are_the_compiled_loop(small, self_loop):
 
 def test_rewards_that_vary_are_cut_without_a_trace(small, monkeypatch):
     """exp(beta r) is made a piece at a time: streams longer than a piece."""
-    monkeypatch.setattr("erl_torch.learners.s1_lanes.NOISY_ROWS", 777)
+    monkeypatch.setattr("erl_torch.learners.s1.lanes.NOISY_ROWS", 777)
     noisy, learner = small[2], AlgorithmS1(beta=3.0, lr_u=0.02, n_epochs=1, n_bias=2)
     for experience in (noisy, noisy[1]):
         found = Replicas.of(learner, N).fit(experience, 6, 3)

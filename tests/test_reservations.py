@@ -13,12 +13,8 @@ from test_config import composed
 
 import erl_torch
 from erl_torch import NonFiniteError, TabularMDP, Transitions, collect
-from erl_torch.empirical import empirical_mdp, tally
-from erl_torch.envs.windy_cliff import WindyCliffEnv
-from erl_torch.learners import LEARNERS, EfficientS1
-from erl_torch.notes import collected, note
-from erl_torch.replicated import _reservations
-from erl_torch.reservations import (
+from erl_torch.empirical.counts import empirical_mdp, tally
+from erl_torch.empirical.reservations import (
     FAR,
     Reservation,
     _covered,
@@ -32,11 +28,15 @@ from erl_torch.reservations import (
     of_states,
     of_theta,
 )
-from erl_torch.reservations import unlikely as is_unlikely
+from erl_torch.empirical.reservations import unlikely as is_unlikely
+from erl_torch.empirical.uncertainty import Estimate, theta_uncertainty
+from erl_torch.envs.windy_cliff import WindyCliffEnv
+from erl_torch.learners import LEARNERS, EfficientS1
+from erl_torch.notes import collected, note
+from erl_torch.run.replicated import _reservations
+from erl_torch.run.training import train
 from erl_torch.solution import Status
 from erl_torch.solvers import solve_soft_bellman
-from erl_torch.training import train
-from erl_torch.uncertainty import Estimate, theta_uncertainty
 
 SHORT = ("learner.n_epochs=2", "learner.n_bias=2", "evaluation.pictures=false")
 NOISE, FROM_PRIOR = "rewards vary for the same (s,a)", "no draws from the prior policy"
@@ -53,7 +53,7 @@ def changed(data, **columns):
 @pytest.fixture(autouse=True)
 def no_pictures(monkeypatch):
     """Replicas always draw: seconds, and tests of their own."""
-    monkeypatch.setattr("erl_torch.replicated.pictures.bands", lambda *_, **__: np.zeros((4, 4, 3), np.uint8))
+    monkeypatch.setattr("erl_torch.run.replicated.pictures.bands", lambda *_, **__: np.zeros((4, 4, 3), np.uint8))
 
 
 @pytest.fixture(scope="module")
@@ -145,7 +145,7 @@ def test_noise_beyond_its_expansion_is_bounded_by_the_largest_reward(cliff):
     data = collect(cliff, 50, 1000, 0)
     rare = changed(data, r=data.r + 3.0 * (np.random.default_rng(0).random(len(data)) < 0.1))
     counted = count(rare, 15, 4, False)
-    (line,) = erl_torch.reservations.of_noise(counted, 100.0)
+    (line,) = erl_torch.empirical.reservations.of_noise(counted, 100.0)
     at = line.text.split("(s=")[1].split(")")[0]
     s, a = map(int, at.split(", a="))
     here = rare.r[(rare.s == s) & (rare.a == a)]
@@ -346,7 +346,7 @@ def test_binned_cart_pole_is_no_success_unless_theta_is_right(tmp_path, capsys, 
 
 
 def test_why_the_data_say_nothing(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("erl_torch.training.SMALL", 14)
+    monkeypatch.setattr("erl_torch.run.training.SMALL", 14)
     result = train(composed("experience.n_episodes=20", *SHORT), tmp_path)
     out = capsys.readouterr().out
     assert result["data"] == "nothing: the stream meets 15 states, and more than 14 are not solved beside a run"

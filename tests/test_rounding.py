@@ -22,10 +22,10 @@ from erl_torch import (
     solve_biasing,
     solve_soft_bellman,
 )
-from erl_torch.certificates import gains, objective, policy_gains
-from erl_torch.chains import RegenerativeLU, SingularChainError, long_run
 from erl_torch.evaluation import Judge
 from erl_torch.evaluation import objective as worth
+from erl_torch.mdp.certificates import gains, objective, policy_gains
+from erl_torch.mdp.chains import RegenerativeLU, SingularChainError, long_run
 from erl_torch.notes import Note
 from erl_torch.solution import proven
 
@@ -307,7 +307,7 @@ def test_indices_out_of_range_are_named(layout):
 
 
 def test_states_that_are_never_left_do_not_reach_superlu(monkeypatch):
-    monkeypatch.setattr("erl_torch.chains.SPARSE_STATES", 0)
+    monkeypatch.setattr("erl_torch.mdp.chains.SPARSE_STATES", 0)
     chain = sp.csr_array(np.array([[0.5, 0.5, 0.0], [0.0, 1.0, 0.0], [0.5, 0.0, 0.5]]))
     with pytest.raises(SingularChainError, match="state 1 is never left"):
         RegenerativeLU(chain, 0)

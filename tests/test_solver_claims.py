@@ -13,7 +13,7 @@ from many_digits import problem
 from erl_torch import InputError, Status, TabularMDP, certify, iterate_biasing, solve_biasing, solve_soft_bellman
 from erl_torch.solvers import soft_bellman
 from erl_torch.solvers.biasing import PATIENCE
-from erl_torch.solvers.compiled import NewtonPattern
+from erl_torch.solvers.newton import NewtonPattern
 from erl_torch.solvers.problem import Problem
 from erl_torch.solvers.result import exact_solution
 

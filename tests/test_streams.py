@@ -29,13 +29,13 @@ from erl_torch import (
     record,
     save_columns,
 )
-from erl_torch.empirical import empirical_mdp, tally
+from erl_torch.empirical.counts import empirical_mdp, tally
 from erl_torch.envs.discretise import Discretise
+from erl_torch.experience.recording import ColumnWriter, _Minari, check_target
+from erl_torch.experience.transitions import COLUMNS, Parts, regroup
 from erl_torch.learners import LEARNERS
-from erl_torch.recordings import ColumnWriter, _Minari, check_target
 from erl_torch.rng import streams
-from erl_torch.training import train
-from erl_torch.transitions import COLUMNS, Parts, regroup
+from erl_torch.run.training import train
 
 MDP = random_mdp(np.random.default_rng(0), 5, 3)
 PLAIN = collect(MDP, 13, 1000, 1)

@@ -16,7 +16,9 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from test_config import composed
 
-from erl_torch import InputError, cli, sweeps
+from erl_torch import InputError
+from erl_torch.cli import main as cli
+from erl_torch.cli import sweeps
 from erl_torch.files import alone
 
 # A program of jobs that end in every way there is, without torch: what they do is in the key `end`.
@@ -25,7 +27,7 @@ import os, signal, sys, time
 from pathlib import Path
 import hydra
 from hydra.core.config_store import ConfigStore
-from erl_torch import cli
+from erl_torch.cli import main as cli
 from erl_torch.checks import InputError
 from erl_torch.files import write_json
 

@@ -19,9 +19,10 @@ from omegaconf import OmegaConf
 from test_board import events, undocumented
 from test_config import composed
 
-from erl_torch import InputError, Solution, Status, Transitions, cli, evaluate
+from erl_torch import InputError, Solution, Status, Transitions, evaluate
+from erl_torch.cli import main as cli
 from erl_torch.learners import LEARNERS
-from erl_torch.training import train
+from erl_torch.run.training import train
 
 SMALL = ("experience.n_episodes=20", "learner.n_epochs=2", "learner.n_bias=3")
 

@@ -20,11 +20,11 @@ from erl_torch import (
     policy_uncertainty,
     solve_soft_bellman,
     theta_uncertainty,
-    uncertainty,
 )
+from erl_torch.empirical import uncertainty
+from erl_torch.empirical.uncertainty import _multinomial
 from erl_torch.envs.windy_cliff import WindyCliffEnv
 from erl_torch.evaluation import objective
-from erl_torch.uncertainty import _multinomial
 
 CLIFF = WindyCliffEnv().mdp
 UNIFORM = np.full((15, 4), 0.25)

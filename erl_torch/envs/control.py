@@ -2,7 +2,7 @@
 
 A ``ControlTask`` holds the dynamics of one of Gymnasium's environments as pure functions over tensors, so that many
 states step at once on any device. ``ControlEnv`` is the same task with Discrete spaces over Gymnasium's own
-environment. ``erl_torch.envs.estimate`` turns a task into a TabularMDP, ``erl_torch.envs.rollout`` plays episodes in
+environment. ``erl_torch.envs.estimate`` turns a task into a TabularMDP, ``erl_torch.experience.rollouts`` plays episodes in
 the original dynamics.
 
 A state tensor is [N, d]; columns are best contiguous (``torch.stack(columns).T``). All is float64.
@@ -24,7 +24,7 @@ from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.envs import CONTROL_TASKS
 from erl_torch.envs.discretise import Discretise, UniformBins
-from erl_torch.transitions import Transitions
+from erl_torch.experience.transitions import Transitions
 
 REWARDS = ("original", "cyclic")
 
@@ -179,7 +179,7 @@ class ControlEnv(gym.Env[np.int64, np.int64]):
 
     def collect(self, n_episodes: int, episode_length: int, **arguments: Any) -> Transitions:
         """Episodes of this environment, all at once; arguments as in ``collect_rollouts``."""
-        from erl_torch.envs.rollout import collect_rollouts
+        from erl_torch.experience.rollouts import collect_rollouts
 
         settings: dict[str, Any] = {"bins": self.bins, "reward": self.reward} | arguments
         if self.task.max_action is not None:

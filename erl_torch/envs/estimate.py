@@ -31,7 +31,7 @@ from erl_torch import checks, kernels
 from erl_torch.envs.control import ControlTask, control_task
 from erl_torch.envs.discretise import UniformBins
 from erl_torch.files import read_npz, write_npz
-from erl_torch.mdp import TabularMDP
+from erl_torch.mdp.tabular import TabularMDP
 
 FORMAT = 2  # of the cache; goes up whenever the same settings give another model, so that none is used that is old
 CHUNK = 32_000  # samples at once: they fit a core's cache, and torch starts no threads for fewer than 32,768

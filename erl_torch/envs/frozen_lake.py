@@ -11,7 +11,7 @@ import numpy as np
 from erl_torch.checks import InputError
 from erl_torch.envs.grid_world import GridWorld, uniform_wind
 from erl_torch.envs.tabular import GridWorldEnv
-from erl_torch.mdp import TabularMDP
+from erl_torch.mdp.tabular import TabularMDP
 
 MAPS = {
     # Nothing in the way: what wind alone does to a policy.

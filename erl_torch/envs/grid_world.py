@@ -29,7 +29,7 @@ import scipy.sparse as sp
 
 from erl_torch import checks
 from erl_torch.checks import InputError
-from erl_torch.mdp import TabularMDP
+from erl_torch.mdp.tabular import TabularMDP
 
 TILES = "SFRHGWCN"
 ENDS = "HG"

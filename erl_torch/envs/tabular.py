@@ -9,7 +9,7 @@ import numpy as np
 
 from erl_torch.checks import InputError
 from erl_torch.envs.grid_world import GridWorld
-from erl_torch.mdp import TabularMDP
+from erl_torch.mdp.tabular import TabularMDP
 
 
 class TabularEnv(gym.Env[np.int64, np.int64]):

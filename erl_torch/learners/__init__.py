@@ -8,7 +8,7 @@ What a learner asks of its stream it declares: ``averages_exp_reward`` (noise in
 
 from typing import Any
 
-from erl_torch.learners.action_value import (
+from erl_torch.learners.action_value.q_learning import (
     ActionValueState,
     DifferentialSoftQ,
     QLearning,
@@ -17,12 +17,12 @@ from erl_torch.learners.action_value import (
     SoftQ,
     ULearning,
 )
-from erl_torch.learners.algorithm_s1 import AlgorithmS1, ListedS1, S1State
+from erl_torch.learners.action_value.z_learning import ZLearning
 from erl_torch.learners.certainty_equivalence import CertaintyEquivalence, CertaintyEquivalenceState
-from erl_torch.learners.efficient_s1 import EfficientS1, EfficientState, OnlineState
+from erl_torch.learners.efficient_s1.algorithm import EfficientS1, EfficientState, OnlineState
 from erl_torch.learners.exact import Exact, ExactState
-from erl_torch.learners.fitting import NonFiniteError
-from erl_torch.learners.z_learning import ZLearning
+from erl_torch.learners.learner import NonFiniteError
+from erl_torch.learners.s1.algorithm import AlgorithmS1, ListedS1, S1State
 
 LEARNERS: dict[str, Any] = {
     "s1": AlgorithmS1,
@@ -43,9 +43,9 @@ LEARNERS: dict[str, Any] = {
 def states() -> tuple[type, ...]:
     """All classes that states of learners are made of: what a checkpoint may hold."""
     from erl_torch.evaluation import Evaluation
+    from erl_torch.learners.action_value.z_learning import ZState
     from erl_torch.learners.replicas import EachState
-    from erl_torch.learners.s1_lanes import LanesState
-    from erl_torch.learners.z_learning import ZState
+    from erl_torch.learners.s1.lanes import LanesState
     from erl_torch.solution import Solution, Status
 
     return (

@@ -1,7 +1,7 @@
 """Certainty equivalence: count, then solve the empirical model exactly. The yardstick of every tabular learner.
 
 Objective: the average reward minus KL(pi || prior)/beta, that of Algorithm S1; not optimistic. The optimum is over the
-visited pairs of the class of states that the stream shows (``erl_torch.empirical``); states outside keep the prior.
+visited pairs of the class of states that the stream shows (``erl_torch.empirical.counts``); states outside keep the prior.
 The policy's loss in the true MDP, g* - J, falls as 1/tuples: it is what the data allow.
 
 The action a' of the stream is not used, and the stream may come from any behaviour policy.
@@ -18,12 +18,12 @@ import numpy as np
 import torch
 
 from erl_torch import checks
-from erl_torch.empirical import EmpiricalMDP, EmpiricalProblem, empirical_mdp
-from erl_torch.learners.fitting import columns, epochs
-from erl_torch.mdp import check_policy
+from erl_torch.empirical.counts import EmpiricalMDP, EmpiricalProblem, empirical_mdp
+from erl_torch.experience.transitions import Recording
+from erl_torch.learners.learner import columns, epochs
+from erl_torch.mdp.tabular import check_policy
 from erl_torch.solution import Solution, Status, proven
 from erl_torch.solvers.soft_bellman import solve_problem
-from erl_torch.transitions import Recording
 
 
 @dataclass(frozen=True, eq=False)

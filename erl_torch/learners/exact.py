@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from erl_torch import checks
-from erl_torch.mdp import TabularMDP, check_policy
+from erl_torch.mdp.tabular import TabularMDP, check_policy
 from erl_torch.solution import Solution, Status
 from erl_torch.solvers.biasing import KL_TOLERANCE, BiasingState, iterate_biasing, solve_biasing
 from erl_torch.solvers.problem import Problem

@@ -11,8 +11,8 @@ and the size of the blocks. Where the experience comes from:
     Simulation(mdp, seeds)   a stream each, of its seed: the tuples that ``collect`` gives for it. They are kept where
                              they fit (``keep``), else sampled again in every pass, in memory that does not grow.
 
-Published Algorithm S1 runs with its replicas interleaved in one compiled loop (``erl_torch.learners.s1_lanes``), or in
-torch operations on a device (``erl_torch.learners.s1_torch``); all other learners a replica a thread.
+Published Algorithm S1 runs with its replicas interleaved in one compiled loop (``erl_torch.learners.s1.lanes``), or in
+torch operations on a device (``erl_torch.learners.s1.device``); all other learners a replica a thread.
 
 A replica that leaves the finite numbers stays at its last good epoch, named in ``failures``; the others go on.
 """
@@ -31,13 +31,13 @@ import torch
 
 from erl_torch import checks
 from erl_torch.checks import InputError
-from erl_torch.experience import collect
+from erl_torch.experience.collect import collect
+from erl_torch.experience.transitions import Transitions
 from erl_torch.files import read_npz, write_npz
-from erl_torch.learners.algorithm_s1 import AlgorithmS1
-from erl_torch.learners.fitting import NonFiniteError, columns
-from erl_torch.mdp import TabularMDP, check_policy
+from erl_torch.learners.learner import NonFiniteError, columns
+from erl_torch.learners.s1.algorithm import AlgorithmS1
+from erl_torch.mdp.tabular import TabularMDP, check_policy
 from erl_torch.solution import Solution
-from erl_torch.transitions import Transitions
 
 KEEP_BYTES = 1 << 30  # of tuples kept by default
 TUPLE_BYTES = 8  # a tuple in the interleaved loop
@@ -249,7 +249,7 @@ class Replicas:
     ) -> Iterator[ReplicaState]:
         """Yield the state of all replicas after each epoch, from ``state`` on, until the last is done or has failed."""
         self._check(experience, n_states, n_actions)
-        from erl_torch.learners.s1_lanes import can_interleave, interleave
+        from erl_torch.learners.s1.lanes import can_interleave, interleave
 
         run = interleave if can_interleave(self, experience) else each
         return run(self, experience, n_states, n_actions, state)

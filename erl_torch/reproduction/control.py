@@ -15,10 +15,10 @@ import scipy.sparse as sp
 import torch
 
 from erl_torch import estimate_mdp
-from erl_torch.certificates import soft_backup
 from erl_torch.envs.control import control_task
-from erl_torch.envs.rollout import rollout
-from erl_torch.mdp import TabularMDP
+from erl_torch.experience.rollouts import rollout
+from erl_torch.mdp.certificates import soft_backup
+from erl_torch.mdp.tabular import TabularMDP
 from erl_torch.solvers.problem import Problem
 from erl_torch.solvers.result import spread
 

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from erl_torch import perron, solve_soft_bellman
 from erl_torch.envs.windy_cliff import WindyCliffEnv
 from erl_torch.evaluation import induced_distribution, policy_chain, reward_per_step, stationary_distribution
-from erl_torch.mdp import TabularMDP
+from erl_torch.mdp.tabular import TabularMDP
 from erl_torch.pictures import draw_grid, shares
 from erl_torch.reproduction.artifact import (
     NOT_REPRODUCED,

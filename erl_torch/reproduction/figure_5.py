@@ -9,7 +9,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from erl_torch import AlgorithmS1, CertaintyEquivalence, EfficientS1, collect, iterate_biasing
-from erl_torch.comparison import measure, optimum
 from erl_torch.envs.windy_cliff import WindyCliffEnv
 from erl_torch.evaluation import objective, reward_per_step
 from erl_torch.learners import DifferentialSoftQ
@@ -25,6 +24,7 @@ from erl_torch.reproduction.artifact import (
     compared,
     compared_samples,
 )
+from erl_torch.run.comparison import measure, optimum
 
 BETA, HORIZON = 10.0, 1000
 N_EPOCHS, N_BIAS = 15, 6

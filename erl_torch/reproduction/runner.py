@@ -40,10 +40,10 @@ from tqdm import tqdm
 
 from erl_torch import checks
 from erl_torch.checks import InputError
-from erl_torch.config import check_reproduction_keys
 from erl_torch.files import read_npz, write_bytes, write_json, write_npz
 from erl_torch.reproduction import ARTIFACTS, SCALES, load
 from erl_torch.reproduction.artifact import COLUMNS, Artifact, Output
+from erl_torch.run.settings import check_reproduction_keys
 
 DPI = 130
 FINGERPRINT = "fingerprint"

@@ -17,8 +17,8 @@ import scipy.sparse as sp
 import torch
 
 from erl_torch import checks, kernels
-from erl_torch.chains import EPSILON, Elimination, RegenerativeLU, SingularChainError, classes, likely_state
 from erl_torch.checks import InputError
+from erl_torch.mdp.chains import EPSILON, Elimination, RegenerativeLU, SingularChainError, classes, likely_state
 from erl_torch.solution import Status
 
 POWER_STEPS = 300  # cheap ones, on the matrix itself

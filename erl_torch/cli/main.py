@@ -1,0 +1,341 @@
+"""Around ``hydra.main``: help, and errors as one clear line with exit code 1 (bad input) or 2 (usage)."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import math
+import os
+import re
+import shutil
+import signal
+import sys
+import threading
+import traceback
+from collections.abc import Callable
+from concurrent.futures import BrokenExecutor
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+from hydra import compose, initialize_config_dir
+from hydra.core import utils as hydra_utils
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException, OverrideParseException
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException, ValidationError
+
+from erl_torch.checks import InputError, out_of_memory
+from erl_torch.cli import sweeps
+from erl_torch.files import alone, began_with, write_bytes
+from erl_torch.output import lasting
+from erl_torch.run.settings import SCHEMAS, allowed, register
+
+# Here, for jobs in processes of their own: loading the task imports this module, and names directories next.
+register()
+
+BY_RUN = (InputError, ArithmeticError, OSError, MemoryError, BrokenExecutor)
+BY_CONFIGURATION = (HydraException, OmegaConfBaseException)
+OPEN_NODES = (
+    "env.kwargs.",
+    "env.kwargs=",
+    "env.tile_rewards.",
+    "env.tile_rewards=",
+    "vary.",
+    "vary=",
+)  # keys of the user's own: no schema lists them
+
+
+class Signals:
+    """SIGINT and SIGTERM wait for a safe point: an exception out of a signal handler that happens to run
+    inside the compiler or a compiled loop is lost there, or crashes the process. A second signal is not
+    held back.
+
+    So does a user's signal that has a handler: submitit's, which queues the job again before its time is up.
+    The handler is called at the end."""
+
+    def __init__(self) -> None:
+        self.received: int | None = None
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> Signals:
+        if threading.current_thread() is threading.main_thread():
+            numbers = [signal.SIGINT, signal.SIGTERM]
+            numbers += [n for n in (signal.SIGUSR1, signal.SIGUSR2) if callable(signal.getsignal(n))]
+            self._before = {n: signal.signal(n, self._note) for n in numbers}
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *error: Any) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        if kind is SystemExit and self.received in (signal.SIGUSR1, signal.SIGUSR2):
+            self._before[self.received](self.received, None)
+
+    def safe_point(self) -> None:
+        """Raise SystemExit(128 + signal) if one has come."""
+        if self.received is not None:
+            raise SystemExit(128 + self.received)
+
+    def _note(self, number: int, frame: Any) -> None:
+        self.received = number
+        if number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_DFL)
+        with contextlib.suppress(OSError):  # past sys.stderr, which may be in the midst of a word
+            os.write(2, b"\nstopping at the next safe point; what is done will be saved\n")
+
+
+def job(work: Callable[[DictConfig, Path, Callable[[], None]], Any]) -> Callable[[DictConfig], Any]:
+    """A Hydra task out of ``work(cfg, run_directory, safe_point)``.
+
+    ``safe_point`` is to be called where the work may be ended: it raises SystemExit after a signal.
+    Bad input ends a single run with one line and exit code 1; a run directory in which nothing was written goes
+    again, and one that another process writes to is bad input. A job of a multirun that fails says so in a note
+    (``erl_torch.cli.sweeps``) and returns None: a failed trial for a sweeper, and no matter for the other jobs.
+    """
+
+    @functools.wraps(work)
+    def task(cfg: DictConfig) -> Any:
+        lasting()  # in a launcher's process too
+        hydra = HydraConfig.get()
+        directory = Path(hydra.runtime.output_dir)
+        # A directory without a configuration is many runs'.
+        attempt = functools.partial(_attempt, work, cfg, directory, shared=hydra.output_subdir is None)
+        if hydra.mode == RunMode.MULTIRUN:
+            return _one_of_many(attempt, hydra, directory)
+        try:
+            return attempt()
+        except Exception as error:
+            if not expected(error):
+                raise
+            raise SystemExit(_report(error)) from error
+
+    return task
+
+
+def expected(error: BaseException) -> bool:
+    """Whether one line says all: no bug of this program."""
+    return isinstance(error, BY_RUN + BY_CONFIGURATION) or out_of_memory(error)
+
+
+_held: dict[Path, str] = {}  # what Hydra had to write where a run has its own
+
+
+def _save_config(cfg: DictConfig, filename: str, output_dir: Path) -> None:
+    """Hydra's, which writes ``.hydra/`` before the work has had a look at the directory: a command that is refused
+    there would put its settings in the place of the run's."""
+    path = Path(str(output_dir)) / filename
+    text = OmegaConf.to_yaml(cfg)
+    if path.exists():
+        _held[path] = text
+    else:
+        _held.pop(path, None)
+        write_bytes(path, text.encode())
+
+
+hydra_utils._save_config = _save_config
+
+
+def _attempt(work: Callable[..., Any], cfg: DictConfig, directory: Path, shared: bool) -> Any:
+    held = [path for path in _held if directory in path.parents]
+    with contextlib.nullcontext() if shared else alone(directory):
+        try:
+            with Signals() as signals:
+                value = work(cfg, directory, signals.safe_point)
+            for path in held:
+                write_bytes(path, _held[path].encode())
+            return value
+        except BY_RUN:
+            if not held and {entry.name for entry in directory.iterdir()} <= {".hydra"}:
+                shutil.rmtree(directory)
+                above = directory.resolve().parent
+                if above not in (Path.cwd(), *Path.cwd().parents):
+                    with contextlib.suppress(OSError):  # not empty: other runs
+                        above.rmdir()
+            raise
+
+
+def _one_of_many(attempt: Callable[[], Any], hydra: Any, directory: Path) -> Any:
+    sweep, number, launcher = Path(hydra.sweep.dir), hydra.job.num, str(hydra.launcher._target_)
+    sweeps.note(sweep, number, "running", directory=os.path.relpath(directory, sweep), complaint=None)
+    try:
+        value = attempt()
+    except SystemExit:
+        if "submitit" in launcher:
+            raise  # queued again or cancelled: whoever waits for the job sees which
+        sweeps.fail(sweep, number, "stopped by a signal")
+        if "joblib" not in launcher:
+            raise  # the signal was meant for the whole sweep
+        return None
+    except Exception as error:
+        if not expected(error):
+            traceback.print_exc()
+        complaint = _line(error) if expected(error) else f"{type(error).__name__}: {error}"
+        sweeps.fail(sweep, number, complaint)
+        return None
+    sweeps.note(sweep, number, "ended", value=value if isinstance(value, float) and math.isfinite(value) else None)
+    return value
+
+
+def run(main: Callable[[], Any], about: str, conf: Path, config_name: str) -> None:
+    """Call a ``hydra.main`` function with our help and error lines.
+
+    Args:
+        main: the decorated function.
+        about: head of the help text.
+        conf: the configuration directory.
+        config_name: the primary configuration.
+
+    With HYDRA_FULL_ERROR=1 in the environment every traceback is shown.
+    """
+    lasting()
+    typed = sys.argv[1:]
+    try:
+        arguments = _resumed(typed)
+    except InputError as error:
+        raise SystemExit(_report(error)) from None
+    # Keys that no schema lists need Hydra's "++"; the user need not know.
+    arguments = [f"++{a}" if a.startswith(OPEN_NODES) else a for a in arguments]
+    arguments = [b for a in arguments for b in _by_id(a, conf)]
+    sys.argv[1:] = arguments
+    full = bool(os.environ.get("HYDRA_FULL_ERROR"))
+    # Hydra then raises what it would otherwise print over several lines.
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    rows: list[dict[str, Any]] = []
+    try:
+        sweeps.presets()
+        for argument in typed:
+            if argument.startswith("resume="):
+                directory = Path(argument.removeprefix("resume="))
+                _same_modules(directory, arguments, [a for a in typed if a != argument], conf, config_name)
+        for argument in arguments:
+            group, _, value = argument.partition("=")
+            if group in SCHEMAS and re.fullmatch(r"[-+.\d].*|true|false|null", value, re.IGNORECASE):
+                options = sorted(path.stem for path in (conf / group).glob("*.yaml"))
+                raise InputError(group, value, " or ".join(options))  # Hydra has a bare ValueError for it
+        if {"-h", "--help"} & set(arguments):
+            print(_help(about, conf, config_name, [a for a in arguments if not a.startswith("-")]))
+            return
+        with sweeps.patient_launchers() as directories:
+            try:
+                main()
+            finally:
+                rows = [row for directory in directories for row in sweeps.show(directory)]
+    except KeyboardInterrupt:
+        raise SystemExit(130) from None
+    except Exception as error:
+        if rows and len(sweeps.failures(rows)) == len(rows):
+            raise SystemExit(1) from None  # a sweeper has nothing to choose from, and says so in its own way
+        if full or not expected(error):
+            raise
+        raise SystemExit(_report(error)) from None
+    if sweeps.failures(rows):
+        raise SystemExit(1)
+
+
+def _resumed(arguments: list[str]) -> list[str]:
+    """resume=RUN_DIR in full: the arguments that the run began with, and its directory."""
+    given = [a for a in arguments if a.startswith("resume=")]
+    if not given:
+        return arguments
+    directory = Path(given[-1].removeprefix("resume="))
+    began = began_with(directory, "resume")
+    if began is None:
+        raise InputError("resume", directory, "a run directory: one with .hydra/overrides.yaml")
+    for argument in began:  # as Hydra notes them: none of its own settings and options
+        if not re.fullmatch(r"(\+\+|\+|~)?(?!hydra\b)\w[\w@/.:-]*(=.*)?", argument, re.DOTALL):
+            raise InputError("resume", directory, f"that of a run: {argument!r} in its overrides.yaml is no key=value")
+    others = [a for a in arguments if a not in given]
+    return [*began, *others, "hydra.run.dir='{}'".format(str(directory).replace("'", "\\'"))]
+
+
+def _same_modules(directory: Path, arguments: list[str], typed: list[str], conf: Path, config_name: str) -> None:
+    """Raise InputError if the environment of a run directory is of a module that nobody has ``typed``: making it
+    would run that module."""
+    with initialize_config_dir(str(conf.resolve()), version_base="1.3"):
+        cfg = compose(config_name, [a for a in arguments if not a.startswith(("hydra", "-"))])
+    named = str(cfg.env.get("id"))
+    module = named.partition(":")[0]
+    if ":" in named and not any(f"{module}:" in a.partition("=")[2] for a in typed if a.lstrip("+").startswith("env")):
+        allowed = f"named with its module, which is imported: add env={named}"
+        raise InputError("resume", directory, allowed)
+
+
+def _by_id(argument: str, conf: Path) -> list[str]:
+    """env=ID for env=NAME: the configuration with that id, or any environment of Gymnasium's."""
+    match = re.fullmatch(r"env=((?:[\w.:-]+/)?[\w.:-]+-v\d+)", argument)
+    if not match:
+        return [argument]
+    for path in sorted((conf / "env").glob("*.yaml")):
+        if match[1] in OmegaConf.to_container(OmegaConf.load(path)).values():  # type: ignore[union-attr]
+            return [f"env={path.stem}"]
+    return ["env=gym", f"env.id={match[1]}"]
+
+
+def _help(about: str, conf: Path, config_name: str, overrides: list[str]) -> str:
+    with initialize_config_dir(str(conf.resolve()), version_base="1.3"):
+        cfg = compose(config_name, overrides)
+    choices = [
+        f"  {group.name}={{{','.join(sorted(option.stem for option in group.glob('*.yaml')))}}}"
+        for group in sorted(conf.iterdir())
+        if group.is_dir() and "name" in (cfg.get(group.name) or {})
+    ]
+    head = [
+        about.rstrip(),
+        "",
+        *(["Choices:", *choices, ""] if choices else []),
+        "Keys and values (each is explained in conf/):",
+        "",
+    ]
+    return "\n".join(head) + "\n" + OmegaConf.to_yaml(cfg).rstrip()
+
+
+def _report(error: Exception) -> int:
+    """Print the one line; the exit code."""
+    print(f"error: {_line(error)}", file=sys.stderr)
+    return 2 if isinstance(error, OverrideParseException) else 1
+
+
+def _line(error: Exception) -> str:
+    if isinstance(error, OverrideParseException):
+        return f"{error.override}: not of the form key=value"
+    if isinstance(error, BY_CONFIGURATION):
+        return _explain(error)
+    if isinstance(error, OSError):
+        return f"{error.filename or 'file system'}: {error.strerror or error}"
+    if out_of_memory(error):
+        return f"memory: not enough ({str(error).splitlines()[0] if str(error) else 'the system gives no more'})"
+    if isinstance(error, BrokenExecutor):
+        return f"processes: one was killed, for want of memory perhaps ({error})"
+    return " ".join(str(error).split())
+
+
+def _explain(error: Exception) -> str:
+    """One line out of the several of Hydra and OmegaConf: the override where it is named, then the reason."""
+    reason = error.__cause__ if isinstance(error.__cause__, OmegaConfBaseException) else error
+    said = str(reason)
+    choice = re.search(r"Could not find '(\S+)/([^'/]*)'\s+Available options in '[^']*':\n((?:\t\S+\n?)+)", said)
+    if choice:
+        group, name, options = choice.groups()
+        if group.startswith("hydra/") and name in sweeps.EXTRAS:
+            extra = sweeps.EXTRAS[name]
+            return f"{group}={name}: not installed; pip install -c constraints.txt -e '.[{extra}]'"
+        return str(InputError(group, name, " or ".join(options.split())))
+    missing = re.search(r"Missing mandatory value: (\S+)", said)
+    if missing:
+        return str(InputError(missing[1], "???", f"given, as in {missing[1]}=VALUE"))
+    override = re.search(r"(?:Error merging override|Could not override) '?([^\s']+?)'?\.?(?:\s|$)", str(error))
+    subject = override[1] if override else getattr(reason, "full_key", None)
+    schema = getattr(reason, "object_type", None)
+    if re.search(r"Key '[^']*' (is )?not in", said) and is_dataclass(schema):
+        names = [field.name for field in fields(schema) if field.name != "name"]
+        given = next((a for a in sys.argv[1:] if a.lstrip("+~").startswith(f"{subject}=")), subject)
+        return f"{given}: no such key; there are {', '.join(names)}"
+    given = next((a for a in sys.argv[1:] if a.startswith(str(subject))), str(subject))  # whole, if it has spaces
+    key, typed, value = given.partition("=")
+    key = key.lstrip("+~")
+    takes = allowed(key) if typed else None
+    if takes is not None and isinstance(reason, ValidationError):
+        return str(InputError(key, value, takes))
+    text = " ".join(re.sub(r"\n\s*(full_key|object_type|reference_type)[:=][^\n]*", "", said).split())
+    return f"{subject}: {text}" if subject and subject not in text else text

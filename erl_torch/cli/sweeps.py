@@ -1,0 +1,376 @@
+"""Sweeps: a job that fails or dies costs no other job, and what became of each stands in one table.
+
+``cli.job`` leaves a note of every job in ``.jobs/`` of the sweep's directory: the process that waits for the jobs
+may be another one, on another machine, and need not live as long. ``sweep.json`` is made of these notes and of the
+jobs' ``result.json``, at the end of a sweep and whenever ``python -m erl_torch.cli.sweeps DIRECTORY`` is called.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import math
+import re
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from itertools import count, takewhile
+from pathlib import Path
+from types import NoneType
+from typing import Any
+
+from hydra.core.config_store import ConfigStore
+from hydra.core.plugins import Plugins
+from hydra.core.utils import JobReturn, JobStatus
+from hydra.plugins.launcher import Launcher
+from omegaconf import DictConfig, flag_override, read_write
+
+from erl_torch.checks import InputError
+from erl_torch.files import alone, read_json, write_json
+from erl_torch.output import lasting
+
+EXTRAS = {"joblib": "joblib", "submitit_slurm": "slurm", "submitit_local": "slurm", "optuna": "optuna"}
+COLUMNS = ("theta", "objective", "gap", "seconds")  # of result.json
+LONG = r"(?<==)-?\d*\.\d{5,}(e-?\d+)?$"
+OPEN = ("waiting", "running")
+OVER = ("ended", "failed")  # what a note says of a job that need not be started again
+# What Slurm calls the end of a job, whatever brought it about.
+ENDS = {"BOOT_FAIL", "CANCELLED", "COMPLETED", "DEADLINE", "FAILED", "NODE_FAIL", "OUT_OF_MEMORY", "PREEMPTED"}
+ENDS |= {"TIMEOUT", "GONE"}
+ASK_SLURM = 5.0  # seconds between questions
+
+
+def presets() -> None:
+    """Defaults that suit this project for the plugins that are installed, under the plugins' own names."""
+    Plugins.instance()  # each registers its own first
+    store = ConfigStore.instance()
+    with contextlib.suppress(ImportError):
+        from hydra_plugins.hydra_submitit_launcher.config import SlurmQueueConf
+
+        # A job out of time saves a checkpoint and queues again, as often as it takes.
+        slurm = SlurmQueueConf(cpus_per_task=1, max_num_timeout=1000)
+        store.store(group="hydra/launcher", name="submitit_slurm", node=slurm, provider="erl_torch")
+    with contextlib.suppress(ImportError):
+        from hydra_plugins.hydra_optuna_sweeper.config import Direction, OptunaSweeperConf
+
+        logging.getLogger("alembic").setLevel(logging.WARNING)  # of Optuna's databases; none is used
+        # The objective is a reward, and a trial that fails is no reason to end the study.
+        optuna = OptunaSweeperConf(direction=Direction.maximize, max_failure_rate=1.0)
+        store.store(group="hydra/sweeper", name="optuna", node=optuna, provider="erl_torch")
+
+
+# -- notes and the table ----------------------------------------------------------------------------
+
+
+def note(sweep: Path, number: int, status: str, **more: Any) -> None:
+    """Write down that job ``number`` is running, ended or failed; what else its note says stays."""
+    write_json(_note(sweep, number), _read(_note(sweep, number)) | {"status": status, **more})
+
+
+def fail(sweep: Path, number: int, complaint: str) -> None:
+    """Note that job ``number`` has failed, and say so."""
+    print(f"error: job {number}: {complaint}", file=sys.stderr)
+    note(sweep, number, "failed", complaint=complaint)
+
+
+def _note(sweep: Path, number: int) -> Path:
+    return sweep / ".jobs" / f"{number}.json"
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """A JSON file, or nothing where there is none that can be read."""
+    try:
+        return read_json(path, "path", "") or {}
+    except InputError:
+        return {}
+
+
+def _rows(sweep: Path) -> list[dict[str, Any]]:
+    """The table of ``sweep.json``. Raises InputError where there is none, or a damaged one."""
+    path = sweep / "sweep.json"
+    otherwise = "the same command again makes it anew"
+    found = read_json(path, "directory", otherwise)
+    if found is None:
+        raise InputError("directory", sweep, "that of a sweep: it holds a sweep.json")
+    rows = found.get("jobs")
+    if not (isinstance(rows, list) and rows and all(map(_is_row, rows))):
+        raise InputError("directory", path, f"what a sweep writes: a row of every job; {otherwise}")
+    return rows
+
+
+def _is_row(row: Any) -> bool:
+    return (
+        isinstance(row, dict)
+        and isinstance(row.get("job"), int)
+        and isinstance(row.get("overrides"), list)
+        and all(isinstance(o, str) for o in row["overrides"])
+        and isinstance(row.get("status"), str)
+        and all(isinstance(row.get(key), (str, NoneType)) for key in ("directory", "complaint"))
+    )
+
+
+def _figure(value: Any) -> float | None:
+    """A number of a ``result.json``; None for anything else."""
+    return value if isinstance(value, (int, float)) and not isinstance(value, bool) else None
+
+
+def _plan(sweep: Path, jobs: dict[int, list[str]], anew: bool) -> None:
+    """Add jobs to the table; ``anew`` forgets those of an earlier sweep in this directory."""
+    if anew:
+        shutil.rmtree(sweep / ".jobs", ignore_errors=True)
+    rows = [] if anew else _rows(sweep)
+    rows += [{"job": n, "overrides": overrides, "status": "waiting"} for n, overrides in jobs.items()]
+    write_json(sweep / "sweep.json", {"jobs": rows})
+
+
+def collect(sweep: Path) -> list[dict[str, Any]]:
+    """What has become of the jobs, also written to ``sweep.json``.
+
+    Returns:
+        a row a job: job, overrides, status (of the result, or failed, running, waiting), complaint, theta,
+        objective, gap, seconds and directory; None where there is no such figure.
+
+    Raises:
+        InputError: ``sweep`` holds no ``sweep.json``, or a damaged one.
+    """
+    rows = _rows(sweep)
+    for row in rows:
+        said = row | _read(_note(sweep, row["job"]))
+        row |= {key: (said if _is_row(said) else row).get(key) for key in ("status", "complaint", "directory")}
+        result = _read(sweep / row["directory"] / "result.json") if row["directory"] else {}
+        row |= {key: _figure(result.get(key)) for key in COLUMNS}
+        if row["status"] == "ended":
+            row["status"] = str(result.get("status", "completed"))
+        if row["directory"] and not (sweep / row["directory"]).exists():
+            row["directory"] = None  # bad input: nothing was written
+    write_json(sweep / "sweep.json", {"jobs": rows})
+    if all(row["status"] not in OPEN for row in rows):
+        shutil.rmtree(sweep / ".jobs", ignore_errors=True)
+    return rows
+
+
+def failures(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    return [row for row in rows if row["status"] == "failed"]
+
+
+def table(sweep: Path, rows: Sequence[dict[str, Any]]) -> str:
+    """The rows of ``collect`` as text, with a line a failure below."""
+    shared = [o for o in rows[0]["overrides"] if len(rows) > 1 and all(o in row["overrides"] for row in rows)]
+
+    def own(row: dict[str, Any]) -> str:
+        # Sweepers draw steps of 17 digits.
+        return " ".join(re.sub(LONG, lambda n: f"{float(n[0]):.4g}", o) for o in row["overrides"] if o not in shared)
+
+    def figure(name: str, value: float | None) -> str:
+        return "" if value is None else f"{value:.1f}" if name == "seconds" else f"{value:.6g}"
+
+    lines = [("job", "overrides", "status", *COLUMNS, "directory")]
+    lines += [
+        (str(row["job"]), own(row), row["status"], *(figure(c, row[c]) for c in COLUMNS), row["directory"] or "")
+        for row in rows
+    ]
+    width = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    left = (1, 2, len(width) - 1)  # columns of text
+    text = [
+        "  ".join(f"{c:<{w}}" if i in left else f"{c:>{w}}" for i, (c, w) in enumerate(zip(line, width, strict=True)))
+        for line in lines
+    ]
+    with contextlib.suppress(ValueError):
+        sweep = sweep.resolve().relative_to(Path.cwd())
+    failed, unfinished = failures(rows), sum(row["status"] in OPEN for row in rows)
+    counts = f"{len(rows)} jobs, {len(failed)} failed" + (f", {unfinished} not finished" if unfinished else "")
+    return "\n".join(
+        [
+            "",
+            *(line.rstrip() for line in text),
+            *([f"all jobs: {' '.join(shared)}"] if shared else []),
+            f"{counts}; table: {sweep}/sweep.json; tensorboard --logdir {sweep}",
+            *(f"failed: job {row['job']} ({own(row)}): {row['complaint']}" for row in failed),
+        ]
+    )
+
+
+# -- launchers --------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def patient_launchers() -> Iterator[list[Path]]:
+    """Every launcher that Hydra makes inside is a ``_Patient`` one; gives the directories of their sweeps."""
+    sweeps: list[Path] = []
+    make = Plugins.instantiate_launcher
+
+    def instantiate_launcher(self: Plugins, *, config: DictConfig, **more: Any) -> Launcher:
+        directory = str(config.hydra.sweep.dir)
+        # One directory for all jobs: its name may have a key in it that is swept over.
+        quoted = directory.replace("\\", "\\\\").replace("'", "\\'")
+        given = config.hydra.overrides.hydra
+        with read_write(given), flag_override(given, "struct", False):
+            given.append(f"hydra.sweep.dir='{quoted}'")
+        return _Patient(make(self, config=config, **more), Path(directory), sweeps)
+
+    Plugins.instantiate_launcher = instantiate_launcher  # type: ignore[method-assign,assignment]
+    try:
+        yield sweeps
+    finally:
+        Plugins.instantiate_launcher = make  # type: ignore[method-assign]
+
+
+class _Patient(Launcher):
+    """Runs jobs through ``inner`` until each has ended or failed by itself. One whose process dies is started once
+    more, in the same directory: it goes on from its checkpoint there."""
+
+    def __init__(self, inner: Launcher, sweep: Path, sweeps: list[Path]) -> None:
+        self.inner, self.sweep, self.sweeps = inner, sweep, sweeps
+
+    def setup(self, **_: Any) -> None:
+        """Nothing: ``inner`` is ready."""
+
+    def launch(self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> Sequence[JobReturn]:
+        jobs = {n: list(overrides) for n, overrides in enumerate(job_overrides, initial_job_idx)}
+        _plan(self.sweep, jobs, anew=self.sweep not in self.sweeps)
+        if self.sweep not in self.sweeps:
+            self.sweeps.append(self.sweep)
+        todo = dict(jobs)
+        died: set[int] = set()
+        while todo:
+            # Launchers number from the first. A process that dies takes the pool's others with it: alone, then.
+            first = min(todo)
+            together = takewhile(lambda n: n in todo and n not in died, count(first))
+            numbers = [first] if first in died else list(together)
+            error = None
+            try:
+                with _patient_submitit(self.inner, self.sweep, numbers):
+                    self.inner.launch([todo[n] for n in numbers], numbers[0])
+            except Exception as raised:
+                error = raised
+            before = len(todo), len(died)
+            for number in numbers:
+                if error is not None:
+                    self._wait_for_writer(number)
+                status = _read(_note(self.sweep, number)).get("status")
+                if status in OVER:
+                    del todo[number]
+                elif status == "running" and number not in died:
+                    died.add(number)
+                elif status == "running":
+                    fail(self.sweep, number, "its process died, twice")
+                    del todo[number]
+                elif error is None:
+                    fail(self.sweep, number, "it did not start")
+                    del todo[number]
+            if error is not None and before == (len(todo), len(died)):
+                raise error
+        return [self._returned(number, overrides) for number, overrides in jobs.items()]
+
+    def _wait_for_writer(self, number: int) -> None:
+        """A pool that breaks says so before the last of its processes is dead."""
+        for _ in range(300):
+            said = _read(_note(self.sweep, number))
+            if said.get("status") != "running":
+                return
+            with contextlib.suppress(InputError, FileNotFoundError), alone(self.sweep / said["directory"]):
+                return
+            time.sleep(0.1)
+
+    def _returned(self, number: int, overrides: list[str]) -> JobReturn:
+        value = _read(_note(self.sweep, number)).get("value")
+        return JobReturn(overrides=overrides, status=JobStatus.COMPLETED, _return_value=value)
+
+
+@contextlib.contextmanager
+def _patient_submitit(inner: Launcher, sweep: Path, numbers: Sequence[int]) -> Iterator[None]:
+    """Submitit's launchers give up at the first job that fails; inside, they wait for all."""
+    if not type(inner).__module__.startswith("hydra_plugins.hydra_submitit_launcher"):
+        yield
+        return
+    import submitit
+
+    class Over:
+        def results(self) -> list[None]:
+            return [None]
+
+    map_array = submitit.AutoExecutor.map_array
+
+    def and_wait(self: Any, *arguments: Any) -> list[Over]:
+        _wait(sweep, dict(zip(numbers, map_array(self, *arguments), strict=True)))
+        return [Over() for _ in numbers]
+
+    submitit.AutoExecutor.map_array = and_wait
+    try:
+        yield
+    finally:
+        submitit.AutoExecutor.map_array = map_array
+
+
+def _wait(sweep: Path, jobs: dict[int, Any]) -> None:
+    """Return when every submitit job has ended, failed, or is lost. A job that Slurm no longer runs and that left
+    no result is queued again, once, unless it was cancelled."""
+    array = next(iter(jobs.values())).job_id.split("_")[0]
+    on_slurm = type(next(iter(jobs.values()))).__name__ == "SlurmJob"
+    left, asked = dict(jobs), -math.inf
+    missing: set[int] = set()
+    again: set[int] = set()
+    while left:
+        time.sleep(0.5)
+        states: dict[str, str] = {}
+        if on_slurm and time.monotonic() > asked + ASK_SLURM:
+            states, asked = _slurm_states(array), time.monotonic()
+        for number, job in list(left.items()):
+            state = states.get(job.job_id, states.get("any"))
+            if job.paths.result_pickle.exists():
+                error = job.exception()
+                if error is not None and _read(_note(sweep, number)).get("status") not in OVER:
+                    fail(sweep, number, str(error).strip().splitlines()[-6])
+                del left[number]
+            elif not on_slurm:
+                if job.done(force_check=True) and not job.paths.result_pickle.exists():
+                    del left[number]
+            elif state in ENDS and number not in missing:
+                missing.add(number)  # a shared file system may need a moment to show the result
+            elif state in ENDS and (state == "CANCELLED" or number in again or not _requeue(job.job_id)):
+                fail(sweep, number, f"Slurm job {job.job_id} ended without a result: {state}")
+                del left[number]
+            elif state is not None:
+                if state in ENDS:
+                    again.add(number)
+                    print(f"job {number}: {state}, queued again", file=sys.stderr)
+                missing.discard(number)
+
+
+def _slurm_states(array: str) -> dict[str, str]:
+    """State of each task of a job array; nothing where Slurm does not answer: it is asked again."""
+    command = ["squeue", "--noheader", "--array", "--states=all", f"--jobs={array}", "--format=%i %T"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode:
+        return {"any": "GONE"} if "Invalid job id" in done.stderr else {}
+    return {"any": "GONE"} | dict(line.split() for line in done.stdout.splitlines())
+
+
+def _requeue(job_id: str) -> bool:
+    return subprocess.run(["scontrol", "requeue", job_id], capture_output=True).returncode == 0
+
+
+def show(sweep: Path) -> list[dict[str, Any]]:
+    """Collect the jobs and print their table."""
+    rows = collect(sweep)
+    print(table(sweep, rows))
+    return rows
+
+
+def main(arguments: Sequence[str]) -> int:
+    lasting()
+    if len(arguments) != 1:
+        print("usage: python -m erl_torch.cli.sweeps DIRECTORY", file=sys.stderr)
+        return 2
+    try:
+        rows = show(Path(arguments[0]))
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    return 1 if failures(rows) else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))

@@ -1,0 +1,244 @@
+"""The empirical model of a stream: visit counts, transition frequencies, mean rewards.
+
+What no tuple shows is no part of the problem. ``EmpiricalMDP.problem`` poses it over what remains:
+
+    pairs     a pair (s,a) never visited is not available: the optimum is over the visited pairs. The KL cost is still
+              that of the whole prior, so with m(s) the prior's mass on the visited actions of s
+              sum_visited pi0 exp(beta q) = m sum_visited (pi0/m) exp(beta q): a reward log(m(s))/beta on top.
+    states    a state never left (the last of an episode, say) has no known future: the tuples that lead there are
+              left out, and with them the pairs and states that have no other tuples.
+    classes   where the empirical process has several closed classes, the one with the most tuples is the problem;
+              where it has one, states from which it is reached are in too.
+
+States outside keep the prior policy. ``message`` says what was left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from erl_torch import checks, kernels
+from erl_torch.checks import InputError
+from erl_torch.experience.transitions import Recording
+from erl_torch.mdp.chains import classes
+from erl_torch.mdp.tabular import check_prior, normalise_rows
+from erl_torch.solvers.problem import Problem
+
+BLOCK = 1 << 16  # tuples at a time: they stay in the processor's cache
+
+
+@dataclass(frozen=True, eq=False)
+class EmpiricalMDP:
+    """Sufficient statistics of a stream: S*A and nnz numbers, whatever its length."""
+
+    visits: np.ndarray  # n(s,a), [S, A] int64
+    transition: sp.csr_array  # n(s,a,s')/n(s,a), [S*A, S]; rows without visits are empty
+    reward: np.ndarray  # mean, [S, A]; 0 without visits
+    reward_variance: np.ndarray  # of one reward, [S, A], divisor n-1; 0 below two visits
+    reward_given_next: np.ndarray  # mean reward of (s,a,s'), [nnz], entries as in `transition`
+
+    @property
+    def n_states(self) -> int:
+        return int(self.visits.shape[0])
+
+    @property
+    def n_actions(self) -> int:
+        return int(self.visits.shape[1])
+
+    def problem(self, beta: float, prior_policy: Any = None) -> EmpiricalProblem:
+        """The empirical problem; see the module's docstring for what is left out.
+
+        Raises:
+            InputError: beta or prior out of range, or no state that is ever returned to.
+        """
+        beta = checks.temperature("beta", beta)
+        prior = check_prior("prior_policy", prior_policy, self.n_states, self.n_actions)
+        used, entries, message, reducible = self._part()
+        inside = used.any(1)
+        states = np.flatnonzero(inside)
+        # A pair that is not used repeats one that is, with a prior of 0: shapes stay [n, A], the graph is unchanged.
+        action = np.where(used, np.arange(self.n_actions), used.argmax(1)[:, None])[states]
+        rows = (states[:, None] * self.n_actions + action).ravel()
+        p = self.transition.copy()
+        p.data = p.data * entries
+        p = sp.csr_array(p[rows][:, states])
+        p.eliminate_zeros()
+        p.sort_indices()
+        normalise_rows(str, p.indptr, p.data, np.inf)
+        weight = (prior * used)[states]
+        mass = weight.sum(1, keepdims=True)
+        reward = np.take_along_axis(self.reward[states], action, axis=1) + np.log(np.minimum(mass, 1.0)) / beta
+        start = self.visits[states].sum(1) / self.visits[states].sum()
+        problem = Problem(states, p, reward, weight / mass, start, float(beta))
+        return EmpiricalProblem(problem, used, message, reducible, np.minimum(mass[:, 0], 1.0))
+
+    def _part(self) -> tuple[np.ndarray, np.ndarray, str, bool]:
+        """(pairs that take part [S, A], entries of ``transition`` that do [nnz], message, several closed classes)."""
+        p, n_actions = self.transition, self.n_actions
+        pair_of = np.repeat(np.arange(self.visits.size), np.diff(p.indptr))
+        alive: np.ndarray = np.asarray(self.visits.any(1))
+        while True:
+            entries = alive[p.indices] & alive[pair_of // n_actions]
+            used = (np.bincount(pair_of, entries, self.visits.size) > 0).reshape(self.visits.shape)
+            if (used.any(1) == alive).all():
+                break
+            alive = np.asarray(used.any(1))
+        if not alive.any():
+            raise InputError("transitions", "a stream that never returns to any state", "long enough to have cycles")
+        lost = self.visits.any(1) & ~alive
+        message = f"states {np.flatnonzero(lost)[:5].tolist()} lead nowhere in this stream" if lost.any() else ""
+        origin, to = pair_of[entries] // n_actions, p.indices[entries]
+        graph = sp.csr_array((np.ones(len(to)), (origin, to)), shape=(self.n_states, self.n_states))
+        label, closed = classes(graph)
+        closed[label[~alive]] = False  # states that take no part are classes of their own
+        if closed.sum() > 1:
+            tuples = np.bincount(label, self.visits.sum(1)) * closed
+            inside = label == np.argmax(tuples)
+            used &= inside[:, None]
+            entries &= inside[pair_of // n_actions]
+            message = (
+                f"{closed.sum()} closed sets of states in this stream; solved on {_name(inside)}, the most visited"
+            )
+        return used, entries, message, bool(closed.sum() > 1)
+
+
+def _name(inside: np.ndarray) -> str:
+    states = np.flatnonzero(inside)
+    return f"{states[:5].tolist()}{'...' if len(states) > 5 else ''}"
+
+
+@dataclass(frozen=True, eq=False)
+class EmpiricalProblem:
+    """The soft Bellman problem that a stream poses."""
+
+    problem: Problem  # on the states that take part
+    used: np.ndarray  # [S, A] bool, pairs that take part
+    message: str  # what was left out, and why; "" if nothing was
+    reducible: bool  # the stream shows several closed classes; this is the most visited
+    tried: np.ndarray  # the prior's mass on the pairs that take part, [n]
+
+
+@dataclass(frozen=True, eq=False)
+class Tally:
+    """What one pass over a stream tells, in memory for S*A pairs and the distinct (s,a,s')."""
+
+    visits: np.ndarray  # [S*A] int64
+    indptr: np.ndarray  # [S*A + 1], rows of the (s,a,s') met
+    indices: np.ndarray  # [nnz] int32, s', ascending in a row
+    counts: np.ndarray  # [nnz] int64
+    reward_given_next: np.ndarray  # mean, [nnz]
+    last_reward: np.ndarray  # of the last visit, [S*A]; 0 without visits
+    varied: bool  # a pair has had two rewards
+    reward_range: tuple[float, float]
+    psi_weight: np.ndarray  # [nnz], W of one psi epoch; 0 without lr_psi
+
+    @property
+    def psi_map(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """W as CSR [S*A, S] without the visits that have underflowed; the decay is (1 - lr_psi)**visits."""
+        kept = self.psi_weight > 0
+        indptr = np.concatenate(([0], np.cumsum(kept)))[self.indptr]
+        return indptr, self.indices[kept], self.psi_weight[kept]
+
+
+def tally(data: Recording, n_states: int, n_actions: int, lr_psi: float = 0.0) -> Tally:
+    """Count a stream: to the same bits, however it is cut.
+
+    Args:
+        data: the tuples; a' is not used.
+        n_states, n_actions: sizes of the tables.
+        lr_psi: step size of lines 2-3 of Algorithm S1, for W; 0: there is none.
+
+    Raises:
+        InputError: naming the first tuple with a state or action out of range.
+    """
+    checks.instance("transitions", data, Recording, "a recording, as of Transitions or open_recording")
+    data.check_range(n_states, n_actions)
+    n_pairs = n_states * n_actions
+    if n_pairs > np.iinfo(np.int32).max:
+        raise InputError("n_states * n_actions", n_pairs, "below 2**31")
+    pairs = np.tile([0.0, 0.0, 1.0, -1.0], (n_pairs, 1))
+    size, used = 512, 0
+    keys, entries = np.empty(size, np.int64), np.zeros((size, 4))
+    table, shift = _table(keys, 0, 2 * size)
+    varied, smallest, largest = False, np.inf, -np.inf
+    for chunk in data.chunks():
+        for begin in range(0, len(chunk), BLOCK):
+            block = slice(begin, begin + BLOCK)
+            pair, s_next, r = chunk.s[block] * np.int32(n_actions) + chunk.a[block], chunk.s_next[block], chunk.r[block]
+            done = 0
+            while done < len(pair):
+                if used == size:
+                    size *= 4
+                    keys, entries = np.resize(keys, size), np.concatenate((entries, np.zeros((size - used, 4))))
+                    table, shift = _table(keys, used, 2 * size)
+                done, used, changed, low, high = kernels.tally(
+                    pair, s_next, r, n_states, lr_psi, shift, table, keys, entries, pairs, used, done
+                )
+                varied, smallest, largest = varied or changed, min(smallest, low), max(largest, high)
+    order = np.argsort(keys[:used])
+    row, indices = np.divmod(keys[:used][order], n_states)
+    counts, totals, weight, _ = entries[order].T
+    return Tally(
+        visits=pairs[:, 0].astype(np.int64),
+        indptr=np.concatenate(([0], np.cumsum(np.bincount(row, minlength=n_pairs)))),
+        indices=indices.astype(np.int32),
+        counts=counts.astype(np.int64),
+        reward_given_next=totals / counts,
+        last_reward=pairs[:, 1].copy(),
+        varied=varied,
+        reward_range=(float(smallest), float(largest)),
+        psi_weight=weight * pairs[row, 2],
+    )
+
+
+def _table(keys: np.ndarray, used: int, size: int) -> tuple[np.ndarray, int]:
+    """(hash table [size, 2] of the entries, shift), for ``kernels.tally``; size a power of two."""
+    table = np.full((size, 2), -1, np.int64)
+    shift = 65 - size.bit_length()
+    kernels.enter(table, keys, used, shift)
+    return table, shift
+
+
+def empirical_mdp(data: Recording, n_states: int, n_actions: int, found: Tally | None = None) -> EmpiricalMDP:
+    """Counts and mean rewards of a stream: one pass over it, and two more where rewards vary.
+
+    Args:
+        data: the tuples; a' is not used.
+        n_states, n_actions: sizes of the tables.
+        found: the tally of the stream, where there is one already.
+
+    Raises:
+        InputError: naming the first tuple with a state or action out of range.
+    """
+    found = found or tally(data, n_states, n_actions)
+    visits, base = found.visits, found.last_reward
+    n = np.maximum(visits, 1)
+    # Around one reward of each pair, so that a constant reward has exactly itself as mean.
+    off, squares = np.zeros(len(visits)), np.zeros(len(visits))
+    reward = base + off
+    if found.varied:
+        with np.errstate(over="ignore", invalid="ignore"):
+            for chunk in data.chunks():
+                pair = chunk.s * np.int32(n_actions) + chunk.a
+                np.add.at(off, pair, chunk.r - base[pair])
+            reward = base + off / n
+            for chunk in data.chunks():
+                pair = chunk.s * np.int32(n_actions) + chunk.a
+                np.add.at(squares, pair, (chunk.r - reward[pair]) ** 2)
+        if not np.isfinite(squares).all():
+            low, high = found.reward_range
+            raise InputError("r", f"between {low:g} and {high:g}", "of a size whose squares are finite numbers")
+    rows = np.diff(found.indptr)
+    return EmpiricalMDP(
+        visits=visits.reshape(n_states, n_actions),
+        transition=sp.csr_array(
+            (found.counts / np.repeat(n, rows), found.indices, found.indptr), shape=(len(visits), n_states)
+        ),
+        reward=reward.reshape(n_states, n_actions),
+        reward_variance=(squares / np.maximum(visits - 1, 1)).reshape(n_states, n_actions),
+        reward_given_next=found.reward_given_next,
+    )

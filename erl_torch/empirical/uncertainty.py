@@ -1,0 +1,628 @@
+"""How far theta and a policy's value may be off, from the visit counts alone.
+
+J(pi), the reward rate less KL/beta, of the empirical model moves with each row p(.|s,a) and mean reward that the data
+got wrong. To first order, with V the relative value of pi and d its stationary distribution over pairs,
+
+    dJ = sum_{s,a} d(s,a) (dr(s,a) + sum_s' dp(s'|s,a) V(s')),
+    Var J = sum_{s,a} d(s,a)^2 Var(r + V(s') | s,a) / n(s,a)
+
+r and s' of one tuple may go together, so the variance is that of their sum, estimated with divisor n - 1.
+theta* = -J(pi*): to move pi* with the data is of second order (J is flat there), so the same formula holds. One more
+sample of (s,a) takes d^2 Var (1/n - 1/(n+1)) = d^2 Var / (n (n+1)) off the variance: the pair where that is largest
+comes first.
+
+The interval is that of the likelihood (Owen's, with a successor that was never seen): all values of J of models with
+
+    sum_{s,a} n(s,a) (sum_s' p log(p/q) + dr^2 / (2 Var(r | s,a,s'))) <= t^2 / 2,
+
+p the frequencies, q the model's rows, dr what its mean reward is off beyond what q makes of it. A row may also lead
+where another action leads that shares its state and a successor with it, or where most states lead, or, where
+a successor has one draw alone, anywhere: n draws may hide an event of chance 1 - exp(-t^2/2n). Few events make the
+interval wide and lopsided; where much was seen it is value -+ t se. Each end is found by steps: to the models worst
+to first order, J there, and on.
+
+What is assumed: the draws of a pair are independent and alike, noise in the reward of one (s,a,s') is about normal in
+its mean, and what was seen nowhere (a state, a penalty) is not there. Then
+
+    second order  noise in the rows moves J on average (the optimum of a model with errors picks among its errors and
+                  looks better than it is): derived in docs/theory.md, 4, and taken off
+    luck          where actions' values differ by less than their noise and 1/beta is small beside it, the optimum
+                  takes the luckier one: the mean of its luck widens one side
+    never tried   pairs widen one side, were they to bring the best that was seen from their state
+
+``smallest_visits`` is the fewest draws of a pair behind at least 1% of the variance; ``withheld`` says why there is no
+interval, where there is none.
+
+A state that the data never show is no part of the problem (``erl_torch.empirical.counts``), nor of the error.
+
+The bootstrap draws n(s,a) successors anew for every pair (multinomial; the reward's mean with the noise left at a given
+successor), and solves each model: it sees the second order, and takes off nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from statistics import NormalDist
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.sparse as sp
+from scipy import optimize, special
+
+from erl_torch import checks, kernels
+from erl_torch.checks import InputError
+from erl_torch.empirical.counts import EmpiricalMDP, EmpiricalProblem
+from erl_torch.evaluation import kl_per_state
+from erl_torch.mdp.certificates import soft_backup
+from erl_torch.mdp.chains import SingularChainError
+from erl_torch.mdp.tabular import check_policy
+from erl_torch.solution import Status
+from erl_torch.solvers.problem import Problem
+from erl_torch.solvers.soft_bellman import solve_problem
+
+COUNTS = 0.01  # share of the variance from which a pair counts
+BIAS_STATES = 1000  # beyond, the second order is an average over random signs: exact, it takes S linear systems
+SIGNS = 100
+FALLS_APART = "the policy's chain falls into parts that double precision cannot join"
+MOST_DIGITS = 15
+LOPSIDED = 0.1  # the middle's distance from the value, in half widths
+HALF = 0.5  # of the plug-in's standard error, that of resamples at least
+MAX_STEPS = 50
+PATIENCE = 10  # steps that gain nothing, where J has kinks
+FAR = 100.0  # logarithm of the price at which likelihood is given away
+CLOSE = 0.01  # part of the half width: an end is found where a step moves it by less (at kinks, a few hundredths)
+TIED = 2.0  # standard errors between two actions' values, up to which either may be the better
+COMMON = 0.5  # share of the states; a successor met from more of them may be met from any
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """A figure with its error; ``str`` gives value and 95% interval: ``theta = 1.0118 +- 0.0009``, or ``[low, high]``
+    where it is lopsided."""
+
+    name: str
+    value: float  # reward a step
+    standard_error: float
+    samples: np.ndarray | None = None  # of the bootstrap, [n]
+    variance: np.ndarray | None = None  # what each pair adds to standard_error^2, [S, A]; plug-in
+    visits: np.ndarray | None = None  # [S, A]
+    freedom: float = np.inf  # of standard_error, as of Student's t
+    bias: float = 0.0  # of second order; taken off ``value`` already
+    untried: tuple[float, float] = (0.0, 0.0)  # by how much pairs never visited may lower and raise the figure
+    smallest_visits: int | None = None  # of the pairs behind at least 1% of the variance
+    withheld: str = ""  # why there is no interval, if there is none
+    limits: Callable[[float], tuple[float, float]] | None = None  # figures of log-likelihood down by as much; plug-in
+
+    def interval(self, level: float = 0.95) -> tuple[float, float]:
+        """Two-sided; infinite where it is withheld. Of a bootstrap the basic one (samples mirrored at the value).
+
+        Of a plug-in estimate that of the likelihood, down by t^2/2, t of Student's distribution; what was never tried
+        comes on top.
+        """
+        level = checks.number("level", level, lambda x: 0 < x < 1, "a number in (0, 1)")
+        if self.withheld:
+            return -np.inf, np.inf
+        if self.samples is not None:
+            low, high = np.quantile(self.samples, [(1 - level) / 2, (1 + level) / 2])
+            return 2 * self.value - float(high), 2 * self.value - float(low)
+        t = float(special.stdtrit(self.freedom, (1 + level) / 2)) if np.isfinite(self.freedom) else _normal(level)
+        low, high = self.value - t * self.standard_error, self.value + t * self.standard_error
+        if self.limits is not None:
+            low, high = self.limits(0.5 * t**2)
+        return low - self.untried[0], high + self.untried[1]
+
+    def next_samples(self, n: int = 5) -> list[tuple[int, int, float]]:
+        """The n pairs (s, a, drop of the variance by one more sample), best first. Plug-in estimates only."""
+        n = checks.at_least("n", n, 1)
+        if self.variance is None or self.visits is None:
+            raise InputError("next_samples", "bootstrap", "asked of a plug-in estimate")
+        drop = self.variance / (self.visits + 1)
+        order = np.argsort(-drop, axis=None, kind="stable")[:n]
+        return [(int(k // drop.shape[1]), int(k % drop.shape[1]), float(drop.flat[k])) for k in order]
+
+    def __str__(self) -> str:
+        if np.isnan(self.value):
+            return f"no {self.name}: {self.withheld}"
+        if self.withheld:
+            return f"{self.name} = {self.value:.4g}, no interval: {self.withheld}"
+        low, high = self.interval()
+        near = min(self.value - low, high - self.value)
+        digits = 4
+        if near > 0:
+            first = int(np.floor(np.log10(near)))  # of its digits; two are shown where the first is a 1
+            digits = min(max(0, (near < 2 * 10.0**first) - first), MOST_DIGITS)
+        # What is printed holds what is meant.
+        unit = 10.0**-digits
+        if abs(0.5 * (low + high) - self.value) > LOPSIDED * 0.5 * (high - low):
+            low, high = np.floor(low / unit) * unit, np.ceil(high / unit) * unit
+            return f"{self.name} = {self.value:.{digits}f} in [{low:.{digits}f}, {high:.{digits}f}]"
+        shown = float(f"{self.value:.{digits}f}")
+        half = max(0.0, np.ceil(max(high - shown, shown - low) / unit - 1e-9)) * unit
+        return f"{self.name} = {self.value:.{digits}f} +- {half:.{digits}f}"
+
+
+def _normal(level: float) -> float:
+    return NormalDist().inv_cdf((1 + level) / 2)
+
+
+def _check_model(model: Any) -> None:
+    checks.instance("model", model, EmpiricalMDP, "an EmpiricalMDP, as of empirical_mdp")
+
+
+def theta_uncertainty(model: EmpiricalMDP, beta: float, prior_policy: Any = None) -> Estimate:
+    """Plug-in estimate of theta* from counts, less its bias of second order, with its error (docs/theory.md, 4).
+
+    Args:
+        model: counts and mean rewards, of ``empirical_mdp``.
+        beta: inverse temperature, 1/reward, > 0.
+        prior_policy: [S, A], entries > 0; None is uniform.
+
+    Raises:
+        InputError: beta or prior out of range, or a stream that never returns to any state.
+    """
+    _check_model(model)
+    part = model.problem(beta, prior_policy)
+    solution = solve_problem(part.problem, model, prior_policy)
+    policy = solution.policy.numpy()
+    try:
+        found = _plug_in(model, part, policy[part.problem.states], optimal=True)
+    except SingularChainError:  # the optimum keeps to a part that the process leaves at last, or all but closed parts
+        return Estimate("theta", np.nan, np.inf, withheld=FALLS_APART)
+    limits = found.limits
+    return replace(
+        found,
+        name="theta",
+        value=-found.value,
+        bias=-found.bias,
+        untried=found.untried[::-1],
+        limits=None if limits is None else lambda budget: (-limits(budget)[1], -limits(budget)[0]),
+    )
+
+
+def policy_uncertainty(model: EmpiricalMDP, policy: Any, beta: float, prior_policy: Any = None) -> Estimate:
+    """J(policy), the reward rate less KL/beta, as the counts have it, less its bias of second order, with its error.
+
+    Args:
+        model: counts and mean rewards, of ``empirical_mdp``.
+        policy: [S, A], rows sum to 1.
+        beta: inverse temperature, 1/reward, > 0.
+        prior_policy: [S, A], entries > 0; None is uniform.
+
+    Raises:
+        InputError: a policy [S, A] that takes an action never tried (in a state of the empirical problem).
+    """
+    _check_model(model)
+    part = model.problem(beta, prior_policy)
+    table = check_policy("policy", policy, model.n_states, model.n_actions)
+    untried = (table > 0) & ~part.used & part.used.any(1, keepdims=True)
+    if untried.any():
+        s, a = np.argwhere(untried)[0]
+        raise InputError(f"policy[{s}, {a}]", table[s, a], "0, as the pair is not in the data")
+    try:
+        return _plug_in(model, part, table[part.problem.states], optimal=False)
+    except SingularChainError:  # a worth for each part
+        return Estimate("J", np.nan, np.inf, withheld=FALLS_APART)
+
+
+def bootstrap_theta(
+    model: EmpiricalMDP,
+    beta: float,
+    prior_policy: Any = None,
+    n_resamples: int = 200,
+    seed: int | np.random.Generator = 0,
+) -> Estimate:
+    """Estimate of theta* with the bootstrap's standard error and samples; the same seed gives the same samples.
+
+    Samples whose model cannot be solved (reducible by the draw) are left out.
+
+    Args:
+        model: counts and mean rewards, of ``empirical_mdp``.
+        beta: inverse temperature, 1/reward, > 0.
+        prior_policy: [S, A], entries > 0; None is uniform.
+        n_resamples: whole number >= 2; each solves a model.
+        seed: a whole number, or a generator.
+
+    Raises:
+        InputError: an argument out of range, or fewer than two samples that can be solved.
+    """
+    _check_model(model)
+    seed = checks.seed("seed", seed)
+    checks.at_least("n_resamples", n_resamples, 2)
+    rng = np.random.default_rng(seed)
+    plug_in = theta_uncertainty(model, beta, prior_policy)
+    p, visits = model.transition, model.visits.ravel()
+    rows = np.repeat(np.arange(len(visits)), np.diff(p.indptr))
+    within = _within(model, p.data, rows)
+    samples = []
+    for _ in range(n_resamples):
+        counts = _multinomial(rng, visits, p, rows)
+        share = counts / visits[rows]
+        mean = np.bincount(rows, share * model.reward_given_next, len(visits))
+        mean += rng.standard_normal(len(visits)) * np.sqrt(within / np.maximum(visits, 1))
+        drawn = sp.csr_array((share, p.indices.copy(), p.indptr.copy()), shape=p.shape)
+        drawn.eliminate_zeros()
+        resampled = replace(model, transition=drawn, reward=mean.reshape(model.reward.shape))
+        try:
+            problem = resampled.problem(beta, prior_policy)
+        except InputError:
+            continue
+        solution = solve_problem(problem.problem, model, prior_policy, tol=1e-8)
+        if solution.status is Status.CONVERGED and not problem.reducible and solution.theta is not None:
+            samples.append(solution.theta)
+    if len(samples) < 2:
+        raise InputError("transitions", f"a stream with {len(samples)} solvable resamples", "longer")
+    error = float(np.std(samples, ddof=1))
+    withheld = plug_in.withheld
+    if not withheld and error < HALF * plug_in.standard_error:
+        withheld = "the resamples vary less than the draws: pairs that matter were drawn too few times"
+    return Estimate("theta", plug_in.value + plug_in.bias, error, samples=np.array(samples), withheld=withheld)
+
+
+def _plug_in(model: EmpiricalMDP, part: EmpiricalProblem, policy: np.ndarray, optimal: bool) -> Estimate:
+    """J of ``policy`` [n, A], on the problem's states; ``optimal``: it moves with the data."""
+    problem = part.problem
+    here = _worth(problem, policy)
+    d, value = np.zeros(model.visits.shape), np.zeros(model.n_states)
+    d[problem.states], value[problem.states] = here.d, here.value
+    with np.errstate(over="ignore", invalid="ignore"):
+        rows = _rows(model, part, value)
+        weight = np.where(part.used, d**2 / np.maximum(rows.n, 1.0), 0.0)
+        variance = weight * rows.variance
+        total = float(variance.sum())
+        bias, bias_error = _second_order(model, part, here, policy, rows, optimal)
+        # Welch and Satterthwaite.
+        unsure = float(((variance / total) ** 2 / np.maximum(rows.n - 1, 1)).sum()) if total > 0 else 0.0
+    untried = _untried(part, here) if optimal else 0.0
+    luck = _luck(part, here, rows, policy) if optimal else 0.0
+    counts = np.flatnonzero(variance > COUNTS * total)
+    estimate = Estimate(
+        "J",
+        here.gain - bias,
+        float(np.sqrt(total)),
+        variance=variance,
+        visits=model.visits,
+        freedom=1 / unsure if unsure > 0 else np.inf,
+        bias=bias,
+        untried=(0.0, untried),
+        smallest_visits=int(model.visits.flat[counts].min()) if counts.size else None,
+        withheld=_same_reward(model, part) or _withheld(total, bias, untried),
+    )
+    if estimate.withheld:  # a correction that cannot be trusted is none
+        return replace(estimate, value=here.gain, bias=0.0)
+
+    @lru_cache(maxsize=8)
+    def limits(budget: float) -> tuple[float, float]:
+        if budget == 0:  # a level too small to tell from 0
+            return here.gain - bias, here.gain - bias
+        low = _furthest(model, part, rows, here, -1.0, budget, policy, optimal, luck > 0)
+        high = _furthest(model, part, rows, here, 1.0, budget, policy, optimal, False)
+        return low - max(bias, 0.0) - 2 * bias_error - luck, high - min(bias, 0.0) + 2 * bias_error
+
+    estimate = replace(estimate, limits=limits)
+    if not np.isfinite(estimate.interval()).all():
+        return replace(estimate, value=here.gain, bias=0.0, withheld="models that fit the data fall into parts")
+    return estimate
+
+
+class _Worth(NamedTuple):
+    """Of a policy [n, A] in a problem."""
+
+    gain: float  # J
+    d: np.ndarray  # its stationary distribution over pairs, [n, A]
+    value: np.ndarray  # relative, [n]
+
+
+def _worth(problem: Problem, policy: np.ndarray) -> _Worth:
+    prior = np.where(policy > 0, problem.prior, 1.0)
+    lu = problem.regeneration(policy)
+    gain, value = lu.poisson((policy * problem.reward).sum(1) - kl_per_state(policy, prior) / problem.beta)
+    return _Worth(gain, lu.stationary()[:, None] * policy, value)
+
+
+def _optimum(problem: Problem, near: np.ndarray, tol: float) -> _Worth:
+    """Of the optimal policy, to ``tol`` in J: soft policy iteration from the value ``near`` [n]."""
+    last = -np.inf
+    for _ in range(MAX_STEPS):
+        found = _worth(problem, soft_backup(problem.action_value(near), problem.prior, problem.beta)[1])
+        if not found.gain > last + tol:
+            break
+        last, near = found.gain, found.value
+    return found
+
+
+class _Rows(NamedTuple):
+    """What the draws of each pair say of x = r + V(s'), [S, A] each."""
+
+    n: np.ndarray  # draws that stay inside the problem
+    share: np.ndarray  # of each transition entry among them, [nnz]
+    x: np.ndarray  # mean of x given s', less the row's mean, [nnz]
+    noise: np.ndarray  # variance of r given s', mean over s'
+    variance: np.ndarray  # of x; divisor n - 1, as that of noise
+
+
+def _rows(model: EmpiricalMDP, part: EmpiricalProblem, value: np.ndarray) -> _Rows:
+    p, shape = model.transition, model.visits.shape
+    inside = np.asarray(part.used.any(1))
+    rows = np.repeat(np.arange(model.visits.size), np.diff(p.indptr))
+    kept = p.data * (inside[p.indices] & part.used.ravel()[rows])
+    total = np.bincount(rows, kept, model.visits.size)
+    n = model.visits.ravel() * total
+    with np.errstate(invalid="ignore", divide="ignore"):
+        share = np.where(kept > 0, kept / total[rows], 0.0)
+    x = model.reward_given_next + value[p.indices]
+    x = x - np.bincount(rows, share * x, model.visits.size)[rows]
+    unbiased = np.where(n > 1.5, n / np.maximum(n - 1, 1), 1.0)
+    noise = _within(model, share, rows) * unbiased
+    variance = np.bincount(rows, share * x**2, model.visits.size) * unbiased + noise
+    used = part.used.ravel()
+    once = used & ~(n > 1.5)
+    # One draw shows no variance: it is given the largest of the others.
+    for each in (noise, variance):
+        each[once] = each[used & ~once].max(initial=0.0)
+        each[~used] = 0.0
+    return _Rows(n.reshape(shape), share, x, noise.reshape(shape), variance.reshape(shape))
+
+
+def _furthest(
+    model: EmpiricalMDP,
+    part: EmpiricalProblem,
+    rows: _Rows,
+    here: _Worth,
+    sign: float,
+    budget: float,
+    policy: np.ndarray,
+    optimal: bool,
+    tied: bool,
+) -> float:
+    """The largest (``sign`` 1) or smallest (-1) J that steps find among models whose log-likelihood is down by
+    ``budget`` at most; of the optimal policy or of ``policy`` [n, A]. Infinite where such a model has no J.
+
+    ``tied``: J has kinks, from one best action to another, and a step against one of them helps the other: where steps
+    gain no more they go against the mean of all policies met so far (fictitious play).
+    """
+    problem = part.problem
+    p, given = _with_successor(model, part, rows, sign * here.value)
+    row = np.repeat(np.arange(problem.reward.size), np.diff(p.indptr))
+    n = np.where(part.used, np.maximum(rows.n, 1.0), np.inf)[problem.states].ravel()
+    noise = rows.noise[problem.states].ravel()
+    moved, cost = np.empty(p.nnz), np.empty(len(n))
+    now, best = here, here.gain
+    weights, weighed, steps, idle = np.zeros(len(n)), np.zeros(p.nnz), 0, 0
+    for _ in range(MAX_STEPS):
+        d = now.d.ravel()
+        x = given + now.value[p.indices]
+        x = x - np.add.reduceat(p.data * x, p.indptr[:-1])[row]
+        if tied:
+            steps, weights, weighed = steps + 1, weights + d, weighed + d[row] * x
+        if idle:
+            d = weights / steps
+            x = np.divide(weighed, weights[row], out=x, where=weights[row] > 0)
+        slope = sign * d / n  # of J, along what one draw says
+        unit = max(float((slope[row] * x).max()), float(np.abs(slope * np.sqrt(noise)).max()))
+        if not np.isfinite(unit):
+            return sign * np.inf
+        if unit <= 1e-30 * float(np.abs(slope).max()) * float(np.abs(x).max()):  # none but by rounding
+            return best
+        slope = slope / unit
+
+        def spent(log_price: float, slope: np.ndarray = slope, x: np.ndarray = x) -> float:
+            """Log of the likelihood spent at a price of it, over the budget; leaves the rows in ``moved``."""
+            at = slope * np.exp(-log_price)
+            kernels.likelihood_rows(p.indptr, p.data, x, at, moved, cost)
+            per_draw = cost + 0.5 * at**2 * noise
+            return float(np.log(np.maximum((n[per_draw > 0] * per_draw[per_draw > 0]).sum(), 1e-300) / budget))
+
+        log_price = _root(spent)
+        spent(log_price)
+        reward = np.add.reduceat(moved * given, p.indptr[:-1]) + slope * np.exp(-log_price) * noise
+        model_there = replace(
+            problem,
+            transition=sp.csr_array((moved.copy(), p.indices, p.indptr), shape=p.shape),
+            reward=problem.reward + reward.reshape(problem.reward.shape),
+        )
+        try:
+            if optimal:
+                now = _optimum(model_there, now.value, 0.1 * CLOSE * abs(best - here.gain))
+            else:
+                now = _worth(model_there, policy)
+        except SingularChainError:
+            return sign * np.inf
+        gained = sign * (now.gain - best)
+        if gained > 0:
+            best = now.gain
+        if not gained > CLOSE * abs(best - here.gain):
+            idle += 1
+            if not np.isfinite(now.gain):
+                return sign * np.inf
+            if not tied or idle == PATIENCE:
+                return best
+    return best
+
+
+def _root(falling: Callable[[float], float]) -> float:
+    """Of a function that falls from above 0 to below, to about a thousandth; few steps where its slope is near -2.
+    -FAR if it is below 0 there."""
+    low = high = 0.0
+    step = 1.0
+    while falling(low) < 0:
+        if low == -FAR:
+            return low
+        high, low, step = low, max(low - step, -FAR), 2 * step
+    while falling(high) >= 0:
+        low, high, step = high, high + step, 2 * step
+    return float(optimize.brentq(falling, low, high, xtol=1e-3))
+
+
+def _with_successor(
+    model: EmpiricalMDP, part: EmpiricalProblem, rows: _Rows, worth: np.ndarray
+) -> tuple[sp.csr_array, np.ndarray]:
+    """(the problem's transitions, in every row with an entry of probability 0 for the successor of most ``worth`` [n]
+    that it may hide; mean reward of each entry less the row's, 0 where it was not seen).
+
+    A row may hide what another action leads to that shares its state and a successor with it, and what is met from most
+    states (a reset, a slip); where it has a successor of one draw alone, any state.
+    """
+    problem = part.problem
+    p, n_actions = problem.transition, problem.n_actions
+    n_rows = p.shape[0]
+    row = np.repeat(np.arange(n_rows), np.diff(p.indptr))
+    _, to, slot = problem.pattern
+    leads = sp.csr_array((np.ones(p.nnz), slot, p.indptr), shape=(n_rows, len(to)))  # row to (state, successor)
+    like = sp.csr_array((leads @ leads.T) @ leads)
+    like = sp.csr_array((worth[to[like.indices]] - worth.min(), like.indices, like.indptr), shape=like.shape)
+    best = np.maximum.reduceat(like.data, like.indptr[:-1])
+    place = np.flatnonzero(like.data == np.repeat(best, np.diff(like.indptr)))
+    hidden = to[like.indices[place[np.searchsorted(place, like.indptr[:-1])]]]
+    met = np.unique(np.stack([p.indices[p.data > 0], row[p.data > 0] // n_actions]), axis=1)[0]
+    common = np.flatnonzero(np.bincount(met, minlength=problem.n_states) > COMMON * problem.n_states)
+    if common.size:
+        reset = common[np.argmax(worth[common])]
+        hidden = np.where(worth[reset] > worth[hidden], reset, hidden)
+    draws = p.data * rows.n[problem.states].ravel()[row]
+    hidden[np.bincount(row, np.abs(draws - 1) < 0.5, n_rows) > 0] = np.argmax(worth)
+    at = np.concatenate([row, np.arange(n_rows)]), np.concatenate([p.indices, hidden])
+    wide = sp.csr_array((np.concatenate([p.data, np.zeros(n_rows)]), at), shape=p.shape)
+    row = np.repeat(np.arange(n_rows), np.diff(wide.indptr))
+    seen = model.transition
+    of_entry = sp.csr_array((model.reward_given_next, seen.indices, seen.indptr), shape=seen.shape)
+    pair = problem.states[row // n_actions] * n_actions + row % n_actions
+    given = np.asarray(of_entry[pair, problem.states[wide.indices]]).ravel()
+    given = np.where(wide.data > 0, given - np.bincount(row, wide.data * given, n_rows)[row], 0.0)
+    return wide, given
+
+
+def _second_order(
+    model: EmpiricalMDP, part: EmpiricalProblem, here: _Worth, policy: np.ndarray, rows: _Rows, optimal: bool
+) -> tuple[float, float]:
+    """(by how much noise in rows moves J on average, standard error of that); docs/theory.md, 4.
+
+    With e(s,a) the error of the mean of r + V(s') and Z = (I - K + 1 d)^-1: dV = Z (sum_a pi e), and on average over d
+
+        sum_a pi (dp dV) + (beta/2) Var_pi(e + p dV),        the second term if the policy moves along.
+
+    That is tr(M Z) + sum |H Z diag(source)^1/2|^2, column by column; of more than BIAS_STATES states, the mean over
+    random signs in place of columns (Hutchinson).
+    """
+    problem = part.problem
+    states, n, n_actions = problem.states, problem.n_states, problem.n_actions
+    lu, d = problem.regeneration(policy), here.d.sum(1)
+    draws = np.maximum(rows.n, 1.0)
+    known = part.used & (rows.n > 1.5)  # what one draw leaves open is a rule's, and no measurement
+    noise = np.where(known, rows.variance / draws, 0.0)[states]
+    # dp of a row goes with its own e alone.
+    p = model.transition
+    pair = np.repeat(np.arange(model.visits.size), np.diff(p.indptr))
+    place = np.full(model.n_states, -1)
+    place[states] = np.arange(n)
+    weight = np.zeros(model.visits.shape)
+    weight[states] = d[:, None] * policy**2
+    entry = (rows.share > 0) & known.ravel()[pair]
+    together = (weight / draws).ravel()[pair[entry]] * (rows.share * rows.x)[entry]
+    at = place[pair[entry] // n_actions], place[p.indices[entry]]
+    matrix = sp.csr_array((together, at), shape=(n, n))
+    found = 0.0
+    source = (policy**2 * noise).sum(1)  # variance of sum_a pi e, state by state
+    if optimal:
+        found = 0.5 * problem.beta * float((here.d * (1 - policy) * noise).sum())  # Var_pi(e)
+        both = problem.beta * d[:, None] * policy * (policy * noise - source[:, None])
+        choose = sp.csr_array((both.ravel(), np.arange(both.size), np.arange(0, both.size + 1, n_actions)))
+        matrix = matrix + choose @ problem.transition
+
+    def through(x: np.ndarray) -> np.ndarray:
+        """Z x."""
+        y = lu.poisson(x)[1]
+        return np.asarray(y + d @ (x - y))
+
+    exact = n <= BIAS_STATES
+    terms = []
+    for x in np.eye(n) if exact else np.random.default_rng(0).choice([-1.0, 1.0], (SIGNS, n)):
+        term = float(x @ (matrix @ through(x)))
+        if optimal:
+            h = (problem.transition @ through(np.sqrt(source) * x)).reshape(n, n_actions)
+            h = h - (policy * h).sum(1, keepdims=True)
+            term += 0.5 * problem.beta * float((here.d * h**2).sum())  # Var_pi(p dV)
+        terms.append(term)
+    if exact:
+        return found + sum(terms), 0.0
+    return found + float(np.mean(terms)), float(np.std(terms, ddof=1) / np.sqrt(SIGNS))
+
+
+def _luck(part: EmpiricalProblem, here: _Worth, rows: _Rows, policy: np.ndarray) -> float:
+    """By how much J may be too large, beyond the second order, where actions' values differ by less than their noise.
+
+    The optimum takes the luckier of actions that may be as good as each other: it gains (1/beta) log mean exp(beta e)
+    on average, e the errors of their values. The second order has (beta/2) Var_pi(e) of that, of a policy that has made
+    its choice already, which is too little where beta e is not small.
+    """
+    problem, n = part.problem, np.maximum(rows.n, 1.0)
+    noise = np.where(part.used, rows.variance / n, 0.0)[problem.states]
+    with np.errstate(divide="ignore"):
+        worth = problem.action_value(here.value) + np.log(problem.prior) / problem.beta
+    best = worth.argmax(1)
+    together = noise + np.take_along_axis(noise, best[:, None], 1)
+    tied = worth.max(1)[:, None] - worth <= TIED * np.sqrt(together)
+    tied &= problem.beta**2 * together > 1  # else the second order has it
+    np.put_along_axis(tied, best[:, None], True, 1)
+    draws = np.random.default_rng(0).standard_normal((SIGNS, 1, problem.n_actions)) * np.sqrt(noise)
+    exponent = np.where(tied, problem.beta * draws, -np.inf)
+    gained = (special.logsumexp(exponent, axis=2) - np.log(tied.sum(1))).mean(0) / problem.beta
+    had = 0.5 * problem.beta * (policy * (1 - policy) * noise).sum(1)
+    return float((here.d.sum(1) * np.where(tied.sum(1) > 1, np.maximum(gained - had, 0.0), 0.0)).sum())
+
+
+def _withheld(variance: float, bias: float, untried: float) -> str:
+    if not variance > 0:
+        return "no pair shows any variance"
+    if not np.isfinite(variance):
+        return "its variance is beyond double precision"
+    if not abs(bias) <= np.sqrt(variance):
+        return "the second order is larger than the first"
+    if untried > 2 * np.sqrt(variance):
+        return "pairs never tried matter more than those that were"
+    return ""
+
+
+def _same_reward(model: EmpiricalMDP, part: EmpiricalProblem) -> str:
+    rewards = model.reward[part.used]
+    if np.ptp(rewards) == 0 and not model.reward_variance[part.used].any():
+        return "every reward seen is the same"
+    return ""
+
+
+def _untried(part: EmpiricalProblem, here: _Worth) -> float:
+    """What J may gain, to first order, from pairs that were never visited, were each to bring its state's best reward
+    and the best successor that was seen from there."""
+    problem = part.problem
+    ptr, to, _ = problem.pattern
+    rewards = problem.reward - np.log(part.tried)[:, None] / problem.beta
+    best = np.max(rewards, axis=1) + np.maximum.reduceat(here.value[to], ptr[:-1])
+    better = problem.beta * (best - here.value - here.gain)
+    with np.errstate(divide="ignore"):
+        gain = np.logaddexp(0.0, np.log1p(-part.tried) + better)
+    return float(here.d.sum(1) @ gain) / problem.beta
+
+
+def _within(model: EmpiricalMDP, weight: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Variance of the reward left once s' is known, mean over s', [S*A]; divisor n."""
+    visits = model.visits.ravel()
+    total = model.reward_variance.ravel() * (visits - 1) / np.maximum(visits, 1)
+    explained = weight * (model.reward_given_next - model.reward.ravel()[rows]) ** 2
+    return np.asarray(np.maximum(total - np.bincount(rows, explained, len(visits)), 0.0))
+
+
+def _multinomial(rng: np.random.Generator, visits: np.ndarray, p: sp.csr_array, rows: np.ndarray) -> np.ndarray:
+    """Counts [nnz] of visits[k] draws from each row, as binomials one entry after another."""
+    counts = np.zeros(len(p.data), np.int64)
+    left, mass = visits.copy(), np.ones(len(visits))
+    width = np.diff(p.indptr)
+    for j in range(int(width.max())):
+        row = np.flatnonzero(width > j)
+        entry = p.indptr[row] + j
+        final = width[row] == j + 1
+        chance = np.where(final, 1.0, np.clip(p.data[entry] / np.maximum(mass[row], 1e-300), 0.0, 1.0))
+        counts[entry] = rng.binomial(left[row], chance)
+        left[row] -= counts[entry]
+        mass[row] -= p.data[entry]
+    return counts

@@ -1,0 +1,232 @@
+"""Experience: a stream of tuples (s, a, r, s', a').
+
+``Recording`` is what learners learn from: tuples that come in chunks, as often as asked. ``Transitions`` holds them in
+memory, as one chunk of five columns; ``erl_torch.experience.recording`` reads those of any size from files.
+"""
+
+from __future__ import annotations
+
+import os
+import zlib
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
+
+import numpy as np
+
+from erl_torch import checks
+from erl_torch.checks import InputError
+from erl_torch.files import read_npz, write_npz
+
+COLUMNS = ("s", "a", "r", "s_next", "a_next")
+Part = TypeVar("Part")
+
+
+@runtime_checkable
+class Recording(Protocol):
+    """A stream of tuples of any size, the same in every pass."""
+
+    def __len__(self) -> int: ...
+
+    def check_range(self, n_states: int, n_actions: int) -> None:
+        """Raise InputError naming the first tuple with a state or action out of range."""
+
+    def chunks(self, multiple: int = 1) -> Iterator[Transitions]:
+        """One pass, in order. The lengths of all chunks but the last are multiples of ``multiple``."""
+
+    def checksum(self) -> int:
+        """Of all columns, however the stream is cut."""
+
+
+@dataclass(frozen=True, eq=False)
+class Transitions:
+    """A stream of tuples, in the order in which they are learnt from.
+
+    ``a_next`` is the action a' ~ prior(.|s') that the sampled backup of Algorithm S1 uses; it need not be
+    the action taken next.
+
+    Args:
+        s, a, s_next, a_next: whole numbers >= 0, [N].
+        r: finite rewards, [N].
+
+    Raises:
+        InputError: the column (and row) that is not as above.
+    """
+
+    s: np.ndarray  # [N] int32
+    a: np.ndarray  # [N] int32
+    r: np.ndarray  # [N] float64
+    s_next: np.ndarray  # [N] int32
+    a_next: np.ndarray  # [N] int32
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            object.__setattr__(self, field.name, _column(field.name, getattr(self, field.name)))
+        for field in fields(self):
+            if len(getattr(self, field.name)) != len(self.s):
+                lengths = {f.name: len(getattr(self, f.name)) for f in fields(self)}
+                raise InputError("columns", f"lengths {lengths}", "of one length")
+        if len(self) == 0:
+            raise InputError("transitions", "0 tuples", "at least one tuple")
+
+    def __len__(self) -> int:
+        return len(self.s)
+
+    def first(self, n: int) -> Transitions:
+        """The first ``n`` tuples."""
+        return self.where(slice(n))
+
+    def where(self, rows: Any) -> Transitions:
+        """The tuples of a slice or mask; at least one."""
+        return Transitions.checked(*(getattr(self, name)[rows] for name in COLUMNS))
+
+    @classmethod
+    def checked(cls, *columns: np.ndarray) -> Transitions:
+        """Of columns that are known to be right, types and lengths included: nothing is looked at again."""
+        if not len(columns[0]):
+            raise InputError("transitions", "0 tuples", "at least one tuple")
+        new = object.__new__(cls)
+        for name, column in zip(COLUMNS, columns, strict=True):
+            object.__setattr__(new, name, column)
+        return new
+
+    def chunks(self, multiple: int = 1) -> Iterator[Transitions]:
+        """Itself: the one chunk."""
+        yield self
+
+    def checksum(self) -> int:
+        """Of all columns."""
+        return Checksum().of(self)
+
+    def check_range(self, n_states: int, n_actions: int) -> None:
+        """Raise InputError naming the first tuple with a state or action out of range."""
+        checks.at_least("n_states", n_states, 1)
+        checks.at_least("n_actions", n_actions, 1)
+        for name, bound in (("s", n_states), ("a", n_actions), ("s_next", n_states), ("a_next", n_actions)):
+            column = getattr(self, name)
+            if column.max() >= bound:
+                row = int(np.argmax(column >= bound))
+                raise InputError(f"{name}[{row}]", int(column[row]), f"below {bound}")
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write the columns to a compressed npz file (temporary name, then renamed)."""
+        return write_npz(path, {field.name: getattr(self, field.name) for field in fields(self)})
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Transitions:
+        """Read what ``save`` wrote, or any npz with these five columns; further arrays are passed over.
+
+        Raises InputError naming the file.
+        """
+        arrays = read_npz(path)
+        missing = [name for name in COLUMNS if name not in arrays]
+        if missing:
+            raise InputError("path", path, f"an npz with columns {', '.join(COLUMNS)}; it lacks {missing[0]}")
+        try:
+            return cls(**{name: arrays[name] for name in COLUMNS})
+        except InputError as error:
+            raise error.of_file(path) from error
+
+
+class Checksum:
+    """A running CRC-32 of each column."""
+
+    def __init__(self) -> None:
+        self.columns = dict.fromkeys(COLUMNS, 0)
+
+    def of(self, chunk: Transitions) -> int:
+        """The checksum of all chunks so far, this one included."""
+        for name, found in self.columns.items():
+            self.columns[name] = zlib.crc32(memoryview(getattr(chunk, name)), found)
+        return zlib.crc32(np.array(list(self.columns.values()), "<u4").tobytes())
+
+
+class Parts(Generic[Part]):
+    """What ``make`` makes of each chunk: once where the stream is in memory, else anew in every pass."""
+
+    def __init__(self, data: Recording, make: Callable[[Transitions], Part], multiple: int = 1) -> None:
+        self._data, self._make, self._multiple = data, make, multiple
+        self._whole = [make(data)] if isinstance(data, Transitions) else []
+
+    @property
+    def whole(self) -> Part:
+        """Of a stream in memory."""
+        return self._whole[0]
+
+    def __iter__(self) -> Iterator[Part]:
+        return iter(self._whole) if self._whole else map(self._make, self._data.chunks(self._multiple))
+
+
+class Selection:
+    """The tuples of a recording for which ``takes_part`` (chunk -> mask [n]) holds: ``n_tuples`` of them, above 0."""
+
+    def __init__(self, data: Recording, takes_part: Callable[[Transitions], np.ndarray], n_tuples: int) -> None:
+        self._data, self._takes_part, self._n = data, takes_part, n_tuples
+
+    def __len__(self) -> int:
+        return self._n
+
+    def check_range(self, n_states: int, n_actions: int) -> None:
+        self._data.check_range(n_states, n_actions)
+
+    def chunks(self, multiple: int = 1) -> Iterator[Transitions]:
+        found = ((chunk, self._takes_part(chunk)) for chunk in self._data.chunks())
+        return regroup((chunk.where(mask) for chunk, mask in found if mask.any()), multiple)
+
+    def checksum(self) -> int:
+        running = Checksum()
+        return [running.of(chunk) for chunk in self.chunks()][-1]
+
+
+def regroup(chunks: Iterable[Transitions], multiple: int) -> Iterator[Transitions]:
+    """The same tuples in chunks of multiples of ``multiple``; the last holds what is left."""
+    held: list[Transitions] = []
+    for chunk in chunks:
+        held.append(chunk)
+        n = sum(map(len, held))
+        whole = n - n % multiple
+        if whole:
+            joined = join(held)
+            held = []
+            yield joined if whole == n else joined.where(slice(whole))
+            if whole < n:  # copied: a view would hold on to the chunk
+                held = [Transitions.checked(*(getattr(joined, name)[whole:].copy() for name in COLUMNS))]
+    if held:
+        yield join(held)
+
+
+def join(chunks: list[Transitions]) -> Transitions:
+    """Chunks as one."""
+    if len(chunks) == 1:
+        return chunks[0]
+    return Transitions.checked(*(np.concatenate([getattr(chunk, name) for chunk in chunks]) for name in COLUMNS))
+
+
+def tuple_at(data: Recording, t: int) -> tuple[int, int, float]:
+    """(s, a, r) of tuple ``t``."""
+    for chunk in data.chunks():
+        if t < len(chunk):
+            return int(chunk.s[t]), int(chunk.a[t]), float(chunk.r[t])
+        t -= len(chunk)
+    raise IndexError(t)
+
+
+def _column(name: str, value: Any) -> np.ndarray:
+    column = checks.real(name, value)
+    if column.ndim != 1:
+        raise InputError(name, f"array of shape {column.shape}", "one-dimensional")
+    if name == "r":
+        if column.dtype.kind == "b":
+            raise InputError(name, f"dtype {column.dtype}", "an array of numbers")
+        column = np.ascontiguousarray(column, dtype=np.float64)
+        if not np.isfinite(column).all():
+            row = int(np.argmin(np.isfinite(column)))
+            raise InputError(f"r[{row}]", column[row], "finite")
+        return column
+    if column.dtype.kind not in "iu" and column.size:
+        raise InputError(name, f"dtype {column.dtype}", "an array of whole numbers")
+    if column.size and (column.min() < 0 or column.max() > np.iinfo(np.int32).max):
+        row = int(np.argmax((column < 0) | (column > np.iinfo(np.int32).max)))
+        raise InputError(f"{name}[{row}]", int(column[row]), "a whole number in [0, 2**31)")
+    return np.ascontiguousarray(column, dtype=np.int32)

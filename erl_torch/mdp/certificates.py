@@ -1,0 +1,186 @@
+"""Bounds that hold in exact arithmetic: on theta*, and on what a policy is worth.
+
+For any V, with TV(s) = (1/beta) log sum_a prior exp(beta (r + E V)) and, for a policy pi,
+T_pi V(s) = sum_a pi (r + E V - log(pi/prior)/beta),
+
+    min(TV - V) <= J(pi_V) <= -theta* <= max(TV - V)        and        min(T_pi V - V) <= J(pi) <= max(T_pi V - V),
+
+whatever the chain; of the second the states suffice that pi comes back to for ever. Proof: TV - V is the one-step
+regularised reward of pi_V with the difference V(s') - V(s) added, which averages to nothing under a stationary
+distribution; and of all policies pi_V has the largest such reward in every state.
+
+The compiled rows (``kernels.gain_rows``, ``kernels.policy_gain_rows``) return each gain with a lower and an upper end
+that rounding cannot leave: E V - V(s) is a sum of p (V(s') - V(s)) over s' other than s, so that no digit is lost where
+a state is rarely left, and the error of an action counts as far as it is chosen (docs/theory.md, 6: every operation).
+The rows of transition, prior and policy are meant as divided by their sums, which are 1 but for rounding.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.sparse as sp
+
+from erl_torch import kernels
+from erl_torch.mdp.chains import (
+    EPSILON,
+    GTH_STATES,
+    RegenerativeLU,
+    Share,
+    SingularChainError,
+    classes,
+    long_run,
+    policy_chain,
+    reachable_from,
+)
+
+SHARP = 1e-11  # of a policy's worth, relative to what it earns: where bounds are as narrow, nothing more is tried
+
+
+class Gains(NamedTuple):
+    """TV - V with what rounding can have done to it, and the policy that attains it."""
+
+    gain: np.ndarray  # [S]
+    low: np.ndarray  # [S]
+    high: np.ndarray  # [S]
+    policy: np.ndarray  # pi_V, [S, A]
+
+    @property
+    def theta_bounds(self) -> tuple[float, float]:
+        """On theta*, reward a step."""
+        return -float(self.high.max()), -float(self.low.min())
+
+
+def gains(transition: sp.csr_array, reward: np.ndarray, prior: np.ndarray, beta: float, value: np.ndarray) -> Gains:
+    """TV - V of ``value`` [S] for a transition matrix [S*A, S], reward and prior [S, A]."""
+    n_states = len(value)
+    gain, low, high = np.empty(n_states), np.empty(n_states), np.empty(n_states)
+    policy = np.empty(reward.shape)
+    p = transition
+    kernels.gain_rows(p.indptr, p.indices, p.data, reward, prior, beta, value, gain, low, high, policy)
+    return Gains(gain, low, high, policy)
+
+
+def policy_gains(
+    transition: sp.csr_array,
+    reward: np.ndarray,
+    prior: np.ndarray,
+    beta: float,
+    policy: np.ndarray,
+    value: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """(low, high) [S] of T_pi V - V, as ``gains``, for any policy [S, A]; -infinite where it leaves the prior."""
+    low, high = np.empty(len(value)), np.empty(len(value))
+    p = transition
+    kernels.policy_gain_rows(p.indptr, p.indices, p.data, reward, prior, beta, policy, value, low, high)
+    return low, high
+
+
+def soft_backup(q: np.ndarray, prior: np.ndarray, beta: float) -> tuple[np.ndarray, np.ndarray]:
+    """((1/beta) log sum_a prior exp(beta q) [S], its policy [S, A]); accurate for any beta > 0 and any prior."""
+    backed_up, policy = np.empty(len(q)), np.empty(q.shape)
+    kernels.soft_rows(np.ascontiguousarray(q), np.ascontiguousarray(prior), beta, backed_up, policy)
+    return backed_up, policy
+
+
+class Objective(NamedTuple):
+    """J(pi), the long-run reward rate less KL/beta from the start, reward a step."""
+
+    value: float  # J but for rounding; only somewhere between low and high where products of probabilities underflow
+    low: float  # low <= J <= high in exact arithmetic
+    high: float
+
+
+def objective(
+    transition: sp.csr_array,
+    reward: np.ndarray,
+    prior: np.ndarray,
+    beta: float,
+    policy: np.ndarray,
+    start: np.ndarray,
+) -> Objective:
+    """J(policy) with bounds.
+
+    Three ways to bound it hold together: the one-step rewards of the states that the policy comes back to (V = 0), the
+    gains of its relative value, and its shares of time where the elimination's error is known. Where products of
+    probabilities underflow, ``value`` is only somewhere between the bounds. The KL of states that the policy leaves for
+    ever does not count.
+    """
+    n_states, n_actions = reward.shape
+    policy = np.asarray(policy, np.float64)
+    sums = policy.sum(1, keepdims=True)
+    policy = np.where(np.abs(sums - 1) > 2e-15, policy / sums, policy)
+    chain = policy_chain(transition, policy)
+    # Which state can follow which, whatever products of probabilities underflow.
+    possible = sp.csr_array((np.ones(transition.nnz), transition.indices, transition.indptr), shape=transition.shape)
+    pattern = policy_chain(possible, (policy > 0).astype(np.float64))
+    label, closed = classes(pattern)
+    ends = closed[label] & reachable_from(pattern, start)
+    within = policy_gains(transition, reward, prior, beta, policy, np.zeros(n_states))
+    low, high = float(within[0][ends].min()), float(within[1][ends].max())
+    if not (np.isfinite(low) and np.isfinite(high)):
+        return Objective(low, low, high)
+    worth = one_step_worth(*within)
+    if chain.nnz < pattern.nnz:
+        share = _share(chain, start)
+        found = 0.5 * (low + high) if share is None else float(share.of_state @ worth)
+        return Objective(min(max(found, low), high), low, high)
+    ends_in = np.unique(label[ends])
+    share = _share(chain, start) if ends.sum() <= GTH_STATES else None
+    if share is None or not np.isfinite(share.relative_error):
+        value, of_one = _by_regeneration(chain, worth, label, ends_in)
+        if value is not None:
+            again = policy_gains(transition, reward, prior, beta, policy, value)
+            low, high = max(low, float(again[0][ends].min())), min(high, float(again[1][ends].max()))
+        share = share or of_one
+        if high - low > SHARP * max(abs(low), abs(high)):
+            share = _share(chain, start, dense=True) or share
+        share = share or _share(chain, start)
+    if share is None:
+        return Objective(0.5 * (low + high), low, high)
+    d = share.of_state[ends]
+    found = float(d @ worth[ends])
+    # The entries of the chain are sums over actions.
+    error = share.relative_error + 2 * n_states * (n_actions + 24) * EPSILON
+    if error < 0.1:
+        off = np.abs(worth[ends] - found)
+        slack = (1.2 * error + (len(d) + 8) * EPSILON) * float(d @ off) + (len(d) + 8) * EPSILON * abs(found)
+        slack += len(d) * 1e-300 * float(off.max())
+        low = max(low, found - 1.2 * float(d @ (worth - within[0])[ends]) - slack)
+        high = min(high, found + 1.2 * float(d @ (within[1] - worth)[ends]) + slack)
+    return Objective(found, min(low, found), max(high, found))
+
+
+def _share(chain: sp.csr_array, start: np.ndarray, dense: bool = False) -> Share | None:
+    try:
+        return long_run(chain, start, dense)
+    except SingularChainError:
+        return None
+
+
+def one_step_worth(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """sum_a pi (r - log(pi/prior)/beta), [S], from its bounds; 0 where they are infinite."""
+    with np.errstate(invalid="ignore"):
+        middle = low + 0.5 * (high - low)
+    return np.where(np.isfinite(middle), middle, 0.0)
+
+
+def _by_regeneration(
+    chain: sp.csr_array, worth: np.ndarray, label: np.ndarray, ends_in: np.ndarray
+) -> tuple[np.ndarray | None, Share | None]:
+    """(relative value [S] of one-step rewards on the closed classes ``ends_in``, 0 elsewhere; the shares of time, if it
+    is one class); None where they cannot be had."""
+    value, share = np.zeros(len(worth)), None
+    for c in ends_in:
+        inside = np.flatnonzero(label == c)
+        try:
+            lu = RegenerativeLU.adapted(sp.csr_array(chain[inside][:, inside]), 0)
+        except SingularChainError:
+            return None, None
+        value[inside] = lu.poisson(worth[inside])[1]
+        if len(ends_in) == 1:
+            of_state = np.zeros(len(worth))
+            of_state[inside] = lu.stationary()
+            share = Share(of_state, np.inf)
+    return value, share

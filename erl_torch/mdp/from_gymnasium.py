@@ -1,0 +1,194 @@
+"""What is known of an environment: its sizes and, where it tells, its model as a TabularMDP.
+
+A model is read from ``env.unwrapped.mdp`` (this package's environments) or ``env.unwrapped.P``, the table
+``P[s][a] = [(probability, s', reward, terminated), ...]`` of Gymnasium's toy_text and many others.
+
+Ends of episodes. The problem solved here is that of an endless process, and P has terminal states, so a reading is
+needed:
+
+    restart  a step that ends the episode leads straight to the start distribution: long-run averages are those
+             of playing episode after episode. Terminal states are left, but never entered.
+    absorb   it leads to the terminal state s', which is never left: its own rows stand where they stay there
+             (as FrozenLake's), and else become a self-loop with reward 0 (as in CliffWalking and Taxi). The average
+             reward is then that of the terminal states; where there are several, the solvers call it reducible.
+
+A reward that depends on s' enters as its mean r(s,a): the objective is linear in the reward, so the optimum is the
+same. Entries of P with the same s' are summed. Time limits are no part of a model.
+"""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import scipy.sparse as sp
+from gymnasium import wrappers
+
+from erl_torch import checks
+from erl_torch.checks import InputError
+from erl_torch.mdp.tabular import TabularMDP, normalise_rows
+
+# Wrappers that leave states, actions, rewards and dynamics as they are.
+NEUTRAL = (
+    wrappers.TimeLimit,
+    wrappers.OrderEnforcing,
+    wrappers.PassiveEnvChecker,
+    wrappers.Autoreset,
+    wrappers.RecordEpisodeStatistics,
+    wrappers.RecordVideo,
+    wrappers.RenderCollection,
+    wrappers.HumanRendering,
+)
+
+
+class MeanRewardWarning(UserWarning):
+    """Rewards of the environment vary for the same (s, a); the model has their mean."""
+
+
+def sizes(source: TabularMDP | gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]) -> tuple[int, int]:
+    """(n_states, n_actions). Raises InputError unless both spaces are Discrete and start at 0."""
+    if isinstance(source, TabularMDP):
+        return source.n_states, source.n_actions
+    single = "single_" if isinstance(source, gym.vector.VectorEnv) else ""
+    spaces = []
+    allowed = "a TabularMDP, or an environment of Gymnasium's"
+    checks.instance("source", source, (gym.Env, gym.vector.VectorEnv), allowed)
+    for name in ("observation_space", "action_space"):
+        space = getattr(source, single + name)
+        if not isinstance(space, gym.spaces.Discrete) or space.start != 0:
+            raise InputError(
+                name, space, "Discrete, starting at 0 (a Box can be cut: env.bins, or erl_torch.envs.Discretise)"
+            )
+        spaces.append(int(space.n))
+    return spaces[0], spaces[1]
+
+
+def known_mdp(source: Any) -> TabularMDP | None:
+    """The MDP that ``source`` follows exactly: itself, or that of one of this package's environments."""
+    if isinstance(source, TabularMDP):
+        return source
+    if not isinstance(source, gym.Env) or changed_by(source) is not None:
+        return None
+    mdp = getattr(source.unwrapped, "mdp", None)
+    return mdp if isinstance(mdp, TabularMDP) else None
+
+
+def tabular_mdp(env: gym.Env[Any, Any], on_end: str = "restart", start: Any = None) -> TabularMDP:
+    """The model of an environment that has one; see the module's docstring.
+
+    Args:
+        env: with Discrete spaces, and ``P`` or ``mdp``; wrappers that change the process are refused.
+        on_end: "restart" or "absorb".
+        start: [S], the start distribution; None is the environment's own.
+
+    Raises:
+        InputError: no model, a table that is not as above, or a model that does not tell the whole process.
+
+    Warns:
+        MeanRewardWarning: rewards depend on s'.
+    """
+    checks.one_of("on_end", on_end, ("restart", "absorb"))
+    checks.instance("env", env, gym.Env, "an environment of Gymnasium's")
+    changed = changed_by(env)
+    if changed is not None:
+        raise InputError("env", env, f"without {changed}, under which the model is not known")
+    base = env.unwrapped
+    mdp = known_mdp(base)
+    if mdp is not None:
+        mdp = TabularMDP(mdp.transition, mdp.reward, mdp.start if start is None else start)
+        ends = np.flatnonzero(getattr(base, "ends", np.zeros(mdp.n_states, bool)))
+        return mdp if on_end == "restart" else _absorbed(mdp, ends, mdp.reward[ends])
+    if getattr(base, "fickle_passenger", False):
+        raise InputError("fickle_passenger", True, "False: P does not tell of it (learn from env.step instead)")
+    n_states, n_actions = sizes(env)
+    row, to, p, r, end = _read(base, n_states, n_actions)
+    n_rows = n_states * n_actions
+    start = _start(base, start, n_states)
+    mean = np.bincount(row, p * r, n_rows)
+    deviation = np.sqrt(np.bincount(row, p * (r - mean[row]) ** 2, n_rows))
+    varies = deviation > 1e-9 * max(1.0, np.abs(r).max())
+    if varies.any():
+        warnings.warn(
+            f"the reward depends on s' for {varies.sum()} of {n_rows} pairs (s, a), with standard deviations up to "
+            f"{deviation.max():.3g}: the model has its mean r(s,a)",
+            MeanRewardWarning,
+            stacklevel=2,
+        )
+    shape = (n_rows, n_states)
+    on = sp.coo_array((p[~end], (row[~end], to[~end])), shape=shape)
+    if on_end == "restart":
+        ending = np.bincount(row[end], p[end], n_rows)
+        transition = on + sp.csr_array(ending[:, None]) @ sp.csr_array(start[None, :])
+        return TabularMDP(transition, mean.reshape(n_states, n_actions), start)
+    mdp = TabularMDP(
+        on + sp.coo_array((p[end], (row[end], to[end])), shape=shape), mean.reshape(n_states, n_actions), start
+    )
+    terminal = np.unique(to[end])
+    both = np.intersect1d(terminal, to[~end & ~np.isin(row // n_actions, terminal)])
+    if both.size:
+        raise InputError("on_end", on_end, f"restart: state {both[0]} is entered with and without an episode's end")
+    return _absorbed(mdp, terminal, np.where(absorbing(mdp)[terminal, None], mdp.reward[terminal], 0.0))
+
+
+def absorbing(mdp: TabularMDP) -> np.ndarray:
+    """[S] bool: states that no action leaves."""
+    rows = np.arange(mdp.n_states * mdp.n_actions)
+    stays = np.asarray(mdp.transition[rows, rows // mdp.n_actions]).reshape(mdp.n_states, mdp.n_actions)
+    return np.asarray((stays > 1 - 1e-12).all(1))
+
+
+def changed_by(env: gym.Env[Any, Any]) -> str | None:
+    """The outermost wrapper of ``env`` that may change the process, or None."""
+    while isinstance(env, gym.Wrapper):
+        if not isinstance(env, NEUTRAL):
+            return type(env).__name__
+        env = env.env
+    return None
+
+
+def _read(base: Any, n_states: int, n_actions: int) -> tuple[np.ndarray, ...]:
+    """(pair, s', probability, reward, terminated) of every entry of ``base.P``."""
+    table = getattr(base, "P", None)
+    if table is None:
+        raise InputError("env", base, "one that has its model as P or mdp (learn from env.step instead)")
+    try:
+        entries = [
+            (s * n_actions + a, to, p, r, bool(end))
+            for s in range(n_states)
+            for a in range(n_actions)
+            for p, to, r, end in table[s][a]
+        ]
+        columns = [np.array(column) for column in zip(*entries, strict=True)]
+        row, to, p, r, end = columns
+        p, r = p.astype(np.float64), r.astype(np.float64)
+    except (KeyError, IndexError, TypeError, ValueError) as error:
+        raise InputError(
+            "P", type(table).__name__, f"P[s][a] = [(p, s', reward, terminated), ...] ({error})"
+        ) from error
+    if to.dtype.kind not in "iu" or to.min() < 0 or to.max() >= n_states:
+        raise InputError("P", f"s' in [{to.min()}, {to.max()}]", f"states in [0, {n_states})")
+    return row, to, p, r, end
+
+
+def _start(base: Any, start: Any, n_states: int) -> np.ndarray:
+    if start is None:
+        start = getattr(base, "initial_state_distrib", getattr(base, "isd", None))
+    if start is None:
+        raise InputError("start", None, "given: the environment does not tell its start distribution")
+    found = checks.array("start", start, (n_states,), checks.NOT_NEGATIVE)
+    normalise_rows(lambda row: "start", np.array([0, n_states]), found, np.inf)
+    return found
+
+
+def _absorbed(mdp: TabularMDP, states: np.ndarray, reward: np.ndarray) -> TabularMDP:
+    """``mdp`` with ``states`` never left and the given rewards, [n] or [n, A], there."""
+    among = np.zeros(mdp.n_states, bool)
+    among[states] = True
+    per_row = np.repeat(among, mdp.n_actions).astype(np.float64)
+    state = np.repeat(np.arange(mdp.n_states), mdp.n_actions)
+    loops = sp.coo_array((per_row, (np.arange(per_row.size), state)), shape=mdp.transition.shape)
+    table = mdp.reward.copy()
+    table[states] = reward
+    return TabularMDP(sp.diags_array(1 - per_row) @ mdp.transition + loops, table, mdp.start)

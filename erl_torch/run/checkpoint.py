@@ -1,0 +1,254 @@
+"""Checkpoints of a run: everything that is needed to go on, bit for bit, in files that no crash can spoil.
+
+A run directory has ``settings.json`` from the start, and ``checkpoints/`` until the run is complete. A checkpoint is a
+line with its SHA-256, then what ``torch.save`` makes of numbers, tensors and containers, the settings of the run among
+them, read back with ``weights_only``. It is written under a temporary name and renamed; the last two are kept, and one
+that is damaged is passed over.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+import math
+import pickle
+import shutil
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from erl_torch.checks import InputError, out_of_memory
+from erl_torch.files import read_json, write_bytes, write_json
+from erl_torch.learners import states
+from erl_torch.log.event_file import PATTERN
+
+FORMAT = 2  # 1 knew no settings
+KEPT = 2
+RESULTS = ("result.json", "solution.npz", "replicas.npz")
+FILES = ("settings.json", *RESULTS, "bands.png", "sweep.png")  # that a run writes under names of its own
+FREE = ("threads", "checkpoint_every")  # settings that no result depends on
+CLASSES: dict[str, Any] = {one.__name__: one for one in states()}
+
+
+class Checkpoints:
+    """The checkpoints of a run directory.
+
+    Args:
+        directory: the run's.
+        settings: what the run computes with; a directory of other settings is refused.
+        every: seconds between checkpoints; 0 is after every epoch, None is none but on a stop.
+        device: where the tables of a checkpoint go.
+
+    Raises:
+        InputError: the directory holds a run of other settings; the first keys that differ are named. Or its
+            ``settings.json`` is damaged.
+    """
+
+    def __init__(self, directory: Path, settings: Mapping[str, Any], every: float | None, device: str = "cpu") -> None:
+        self.directory, self.every, self.device = directory, every, device
+        self._folder = directory / "checkpoints"
+        self._settings = {key: value for key, value in _flat(settings).items() if key.split(".")[0] not in FREE}
+        self._last = time.monotonic()
+        for path in (*(directory / name for name in FILES), *self._folder.glob("*.ckpt")):
+            if path.is_dir():
+                raise InputError("hydra.run.dir", directory, f"that of a run: {path} is a directory")
+        otherwise = "move it away: the checkpoints, if there are any, know their settings"
+        before = read_json(directory / "settings.json", "settings", otherwise)
+        self._ours = before is not None
+        self._others: set[Path] = set()  # event files that are not this run's
+        if before is not None:
+            self._compare(before)
+
+    def start(self) -> dict[str, Any] | None:
+        """Take possession of the directory (leftovers of a killed run go), and ``read``; None: the run begins.
+
+        Raises InputError as ``read``; the directory is then as it was.
+        """
+        found = self.read()
+        write_json(self.directory / "settings.json", self._settings)
+        for leftover in (*self.directory.glob(".*.tmp"), *self._folder.glob(".*.tmp")):
+            leftover.unlink(missing_ok=True)
+        if self._ours and found is None:  # it repeats every record
+            for path in self.directory.glob(PATTERN):
+                path.unlink(missing_ok=True)
+        self._others = set(self.directory.glob(PATTERN))
+        return found
+
+    def read(self) -> dict[str, Any] | None:
+        """The newest checkpoint that can be read; damaged ones go, with a warning.
+
+        Raises InputError for one of other settings, or one that is whole but of another version of the program.
+        """
+        for path in sorted(self._folder.glob("*.ckpt"), reverse=True):
+            try:
+                body = _body(path)
+            except (OSError, ValueError) as error:
+                print(f"warning: {path} cannot be read ({error}): going on from the one before", file=sys.stderr)
+                if isinstance(error, ValueError):
+                    path.unlink(missing_ok=True)
+                continue
+            try:
+                settings, content = _loaded(body)
+                self._compare(settings)
+                found: dict[str, Any] = decode(content, self.device)
+            except (AttributeError, KeyError, TypeError, ValueError, RuntimeError, pickle.UnpicklingError) as error:
+                if isinstance(error, InputError) or out_of_memory(error):
+                    raise
+                said = f"of this version ({' '.join(str(error).split())[:200]}), or moved away"
+                raise InputError("checkpoint", path, said) from error
+            return found
+        return None
+
+    @contextlib.contextmanager
+    def refusing(self, learnt: Callable[[], bool]) -> Iterator[None]:
+        """Bad input that shows before anything is ``learnt`` leaves nothing behind."""
+        try:
+            yield
+        except InputError:
+            if not learnt():
+                for path in {self.directory / "settings.json", *self.directory.glob(PATTERN)} - self._others:
+                    path.unlink(missing_ok=True)
+                self.clear()
+            raise
+
+    def result(self) -> dict[str, Any] | None:
+        """What the run came to, if it is complete.
+
+        Raises InputError for a damaged file, and where there are files of a run whose settings nothing tells.
+        """
+        there = [name for name in RESULTS if (self.directory / name).exists()]
+        if there and not self._ours and not any(self._folder.glob("*.ckpt")):
+            allowed = f"a new one, or that of a run: it holds a {there[0]} without the settings.json behind it"
+            raise InputError("hydra.run.dir", self.directory, allowed)
+        otherwise = "move it away, and the run goes on from its checkpoint or begins again"
+        found = read_json(self.directory / "result.json", "result", otherwise)
+        if found is not None and not {"status", "objective", "seconds"} <= found.keys():
+            raise InputError("result", self.directory / "result.json", f"what a run writes; {otherwise}")
+        return None if found is None or found["status"] == "stopped" else found
+
+    def offer(self, step: int, content: Callable[[], dict[str, Any]], now: bool = False) -> None:
+        """Write ``content()`` as the checkpoint of ``step``, if it is time (or at once, ``now``)."""
+        if not now and (self.every is None or time.monotonic() - self._last < self.every):
+            return
+        _write(self._folder / f"{step:018d}.ckpt", self._settings, content())
+        for path in sorted(self._folder.glob("*.ckpt"))[:-KEPT]:
+            path.unlink(missing_ok=True)
+        self._last = time.monotonic()
+
+    def clear(self) -> None:
+        """The run is complete: none is needed any more."""
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+    def _compare(self, before: Mapping[str, Any]) -> None:
+        differ = sorted(key for key in {**before, **self._settings} if before.get(key) != self._settings.get(key))
+        if differ:
+            shown = ", ".join(f"{key}={self._settings.get(key)} (there: {before.get(key)})" for key in differ[:5])
+            more = f" and {len(differ) - 5} more" if len(differ) > 5 else ""
+            allowed = f"of a run with these settings, or a new one: not {shown}{more}"
+            raise InputError("hydra.run.dir", self.directory, allowed)
+
+
+def rows_of(found: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
+    """What ``fitting.columns`` was given: numbers as numbers, arrays as arrays."""
+    n = max((len(column) for column in found.values()), default=0)
+    plain = {name: column.tolist() if column.ndim == 1 else list(column) for name, column in found.items()}
+    return [{name: column[i] for name, column in plain.items()} for i in range(n)]
+
+
+# -- values and their files -----------------------------------------------------------------------------
+
+
+def encode(value: Any) -> Any:
+    """``value`` in containers, numbers, text and tensors; dataclasses and errors by the name of their class."""
+    if isinstance(value, np.ndarray):
+        return {"class": "array", "value": torch.from_numpy(np.ascontiguousarray(value))}
+    if is_dataclass(value) and not isinstance(value, type):
+        return {"class": type(value).__name__, **{f.name: encode(getattr(value, f.name)) for f in fields(value)}}
+    if isinstance(value, ArithmeticError):
+        return {"class": type(value).__name__, "arguments": list(value.args)}
+    if isinstance(value, Mapping):
+        return {"class": "dict", "items": [(encode(k), encode(v)) for k, v in value.items()]}
+    if isinstance(value, tuple) and hasattr(value, "_asdict"):
+        return {"class": type(value).__name__, **{name: encode(item) for name, item in value._asdict().items()}}
+    if isinstance(value, tuple):
+        return {"class": "tuple", "items": [encode(item) for item in value]}
+    if isinstance(value, list):
+        return [encode(item) for item in value]
+    if isinstance(value, np.generic):
+        return value.item()
+    if hasattr(value, "name") and type(value).__name__ in CLASSES:  # an enumeration
+        return {"class": type(value).__name__, "member": value.name}
+    return value.detach().cpu() if isinstance(value, torch.Tensor) else value
+
+
+def decode(value: Any, device: str = "cpu") -> Any:
+    """What ``encode`` was given. Raises ValueError for a class that no state is made of."""
+    if isinstance(value, list):
+        return [decode(item, device) for item in value]
+    if isinstance(value, torch.Tensor):
+        return value.to(device)
+    if not isinstance(value, dict):
+        return value
+    kind = value["class"]
+    if kind == "array":
+        return value["value"].numpy()
+    if kind == "dict":
+        return {decode(k, device): decode(v, device) for k, v in value["items"]}
+    if kind == "tuple":
+        return tuple(decode(item, device) for item in value["items"])
+    if kind not in CLASSES:
+        raise ValueError(f"unknown class {kind}")
+    if "arguments" in value:
+        return CLASSES[kind](*value["arguments"])
+    if "member" in value:
+        return CLASSES[kind][value["member"]]
+    return CLASSES[kind](**{name: decode(item, device) for name, item in value.items() if name != "class"})
+
+
+def _write(path: Path, settings: Mapping[str, Any], content: Any) -> None:
+    buffer = io.BytesIO()
+    torch.save({"format": FORMAT, "settings": dict(settings), "content": encode(content)}, buffer)
+    body = buffer.getvalue()
+    write_bytes(path, hashlib.sha256(body).hexdigest().encode() + b"\n" + body)
+
+
+def _body(path: Path) -> bytes:
+    """Raises ValueError where the file is not what was written."""
+    line, _, body = path.read_bytes().partition(b"\n")
+    if hashlib.sha256(body).hexdigest().encode() != line:
+        raise ValueError("its checksum does not match")
+    return body
+
+
+def _loaded(body: bytes) -> tuple[dict[str, Any], Any]:
+    """Settings and encoded content."""
+    whole = torch.load(io.BytesIO(body), weights_only=True)
+    if whole["format"] != FORMAT:
+        raise ValueError(f"it is of format {whole['format']}, not {FORMAT}")
+    return whole["settings"], whole["content"]
+
+
+def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for key, value in settings.items():
+        if isinstance(value, Mapping) and value:
+            found |= _flat(value, f"{prefix}{key}.")
+        else:
+            found[f"{prefix}{key}"] = _json(value)
+    return found
+
+
+def _json(value: Any) -> Any:
+    """``value`` as JSON gives it back; it has no infinities."""
+    if isinstance(value, Mapping):
+        return {str(key): _json(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_json(item) for item in value]
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,180 @@
+"""A learnt policy, played in the environment of its run; Hydra stays outside."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from omegaconf import DictConfig, OmegaConf
+
+from erl_torch import checks
+from erl_torch.checks import InputError
+from erl_torch.experience.collect import reset
+from erl_torch.files import write_gif
+from erl_torch.learners.replicas import ReplicaSolution
+from erl_torch.mdp.from_gymnasium import sizes
+from erl_torch.mdp.tabular import check_policy
+from erl_torch.rng import streams
+from erl_torch.run.settings import Play, check_keys
+from erl_torch.run.training import make_env
+from erl_torch.solution import Solution
+
+RUNS = Path("runs")
+TABLES = ("solution.npz", "replicas.npz")
+MODES = {"ansi": "ansi", "gif": "rgb_array"}  # Gymnasium's names
+SHOWN = {"ansi": 10, "gif": 200}  # steps
+
+
+class Played(NamedTuple):
+    """Episodes of one policy."""
+
+    returns: np.ndarray  # [n_episodes], undiscounted, reward
+    lengths: np.ndarray  # [n_episodes], steps
+    ended: np.ndarray  # [n_episodes] bool: by the environment, not by a limit
+    shown: list[Any]  # what the first episode looks like: text, or pictures [H, W, 3]
+
+
+def play(cfg: DictConfig) -> Played:
+    """Play as ``cfg`` (``conf/play.yaml``) says, and print what came of it.
+
+    Raises:
+        InputError: a key or value that cannot be used, or a directory that is no run.
+    """
+    check_keys(cfg, Play)
+    checks.at_least("n_episodes", cfg.n_episodes, 1)
+    checks.at_least("seed", cfg.seed, 0)
+    checks.one_of("render", cfg.render, (*MODES, "none"))
+    if cfg.n_steps is not None:
+        checks.at_least("n_steps", cfg.n_steps, 1)
+    os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # pygame draws without a display
+    run = find_run(cfg.run)
+    settings = run_settings(run)
+    module, colon, _ = str(settings.env.id).partition(":")
+    if cfg.module != (module if colon else None):
+        if colon:
+            allowed = f"typed as module={module}: it makes the run's environment, and runs only if you name it"
+            raise InputError("module", cfg.module, allowed)
+        raise InputError("module", cfg.module, f"left out: no module makes the environment of {run}")
+    table = run_policy(run, cfg.replica)
+    mode = MODES.get(cfg.render)
+    with contextlib.closing(make_env(settings.env)) as plain:
+        n_states, n_actions = sizes(plain)
+        modes = plain.metadata.get("render_modes") or []
+    if mode not in modes and cfg.render == "gif":
+        raise InputError("render", "gif", f"ansi or none: {settings.env.name} draws no pictures")
+    if mode not in modes and cfg.render == "ansi":
+        print(f"note: {settings.env.name} has no text to show" + "; render=gif draws it" * ("rgb_array" in modes))
+    try:
+        table = check_policy("policy", table, n_states, n_actions)
+    except InputError as error:
+        raise InputError("run", run, f"one whose policy fits its environment ({error})") from error
+    if cfg.greedy:
+        table = np.eye(n_actions)[table.argmax(1)]
+    with contextlib.closing(make_env(settings.env, mode if mode in modes else None)) as env:
+        n_shown = (cfg.n_steps or SHOWN[cfg.render]) if mode in modes else 0
+        played = episodes(env, table, cfg.n_episodes, settings.evaluation.horizon, cfg.seed, n_shown)
+        fps = env.metadata.get("render_fps", 10)
+    head = f"{settings.env.name}, {settings.learner.name}" + ("" if cfg.replica is None else f", replica {cfg.replica}")
+    print(_report(f"{head}{', greedy' * cfg.greedy}, seed {cfg.seed} ({run})", played))
+    if cfg.render == "ansi" and played.shown:
+        print(f"\nthe first {len(played.shown) - 1} steps of the first episode:\n")
+        print("\n".join(played.shown))
+    if cfg.render == "gif":
+        which = ("" if cfg.replica is None else f"-replica-{cfg.replica}") + "-greedy" * cfg.greedy
+        path = write_gif(run / f"episode{which}-seed-{cfg.seed}.gif", played.shown, fps)
+        print(f"{'picture':18}{path}")
+    return played
+
+
+def episodes(
+    env: gym.Env[Any, Any], policy: np.ndarray, n_episodes: int, horizon: int, seed: int, n_shown: int = 0
+) -> Played:
+    """Play ``policy`` [S, A]: episodes of at most ``horizon`` steps, each with a random stream of its own.
+
+    ``n_shown`` steps of the first episode are rendered, in the environment's render mode.
+    """
+    cdf = np.cumsum(policy, axis=1)
+    checks.memory("n_episodes", n_episodes, 17 * n_episodes, "the returns and lengths of all episodes")
+    returns, lengths, ended = np.zeros(n_episodes), np.zeros(n_episodes, np.int64), np.zeros(n_episodes, bool)
+    shown: list[Any] = []
+    evaluation = streams(seed).evaluation
+    for i in range(n_episodes):
+        (rng,) = evaluation.spawn(1)
+        s = reset(env, rng)
+        if i == 0 and n_shown:
+            shown.append(env.render())
+            if isinstance(shown[0], np.ndarray):
+                most = min(n_shown, horizon)
+                checks.memory("n_steps", n_shown, shown[0].nbytes * most, f"{most:,} pictures")
+        for _ in range(horizon):
+            a = int(np.searchsorted(cdf[s], rng.random() * cdf[s, -1], side="right"))
+            observation, reward, terminated, truncated, _ = env.step(a)
+            s = int(observation)
+            returns[i] += float(reward)
+            lengths[i] += 1
+            ended[i] = terminated
+            if i == 0 and lengths[0] <= n_shown:
+                shown.append(env.render())
+            if terminated or truncated:
+                break
+    return Played(returns, lengths, ended, shown)
+
+
+def find_run(name: str) -> Path:
+    """The run directory of that name; ``latest`` is the newest below ``runs/``. Raises InputError."""
+    if name == "latest":
+        found = [path for table in TABLES for path in RUNS.rglob(table)]
+        if not found:
+            raise InputError("run", name, f"a run directory: there is no run below {RUNS}/")
+        return max(found, key=lambda path: path.stat().st_mtime_ns).parent
+    directory = Path(name)
+    if not any((directory / table).is_file() for table in TABLES):
+        raise InputError("run", name, f"a run directory of train.py, with {' or '.join(TABLES)}")
+    return directory
+
+
+def run_settings(run: Path) -> DictConfig:
+    """The configuration of ``run``, its environment with its own rewards. Raises InputError."""
+    path = run / ".hydra" / "config.yaml"
+    try:
+        cfg: Any = OmegaConf.load(path)
+        OmegaConf.resolve(cfg)
+        check_keys(cfg)
+        for group, names in (("env", ("name", "id")), ("learner", ("name",)), ("evaluation", ("horizon",))):
+            for name in names:
+                _ = cfg[group][name]
+        if "n_samples" in cfg.env:
+            cfg.env.reward = "original"  # not those of the control task's endless model
+        checks.at_least("evaluation.horizon", cfg.evaluation.horizon, 1)
+    except Exception as error:  # of the parser, of OmegaConf, of values of any kind
+        cause = " ".join(str(error).split())[:200]
+        raise InputError(
+            "run", run, f"a run directory with the configuration {path.relative_to(run)} ({cause})"
+        ) from error
+    return DictConfig(cfg)
+
+
+def run_policy(run: Path, replica: int | None) -> np.ndarray:
+    """The policy [S, A] that ``run`` learnt, or its replica's. Raises InputError."""
+    if (run / "solution.npz").is_file():
+        if replica is not None:
+            raise InputError("replica", replica, f"left out: {run} holds one policy")
+        return np.asarray(Solution.load(run / "solution.npz").policy)
+    found = ReplicaSolution.load(run / "replicas.npz")
+    if not 0 <= (replica or 0) < len(found):
+        raise InputError("replica", replica, f"a whole number in [0, {len(found)})")
+    return np.asarray(found[replica or 0].policy)
+
+
+def _report(head: str, played: Played) -> str:
+    lines = [head, f"{'':18}{'mean':>12}{'quartiles':>26}{'extremes':>26}"]
+    for name, values in (("return", played.returns), ("steps", played.lengths)):
+        least, low, high, most = np.quantile(values, (0, 0.25, 0.75, 1))
+        quartiles, extremes = f"{low:.6g} to {high:.6g}", f"{least:.6g} to {most:.6g}"
+        lines.append(f"{name:18}{values.mean():12.6g}{quartiles:>26}{extremes:>26}")
+    lines.append(f"{'episodes':18}{len(played.returns)}, of which the environment ended {played.ended.sum()}")
+    return "\n".join(lines)

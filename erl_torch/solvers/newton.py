@@ -1,0 +1,55 @@
+"""The eigenvector of M_V by a compiled Newton iteration, for chains whose LU factors stay sparse.
+
+The states' pattern never changes between biasing iterations and Newton steps: it is ordered and its fill found once,
+and every step is then one loop over known places. The method is that of ``eigenpair.solve_log_perron``, which takes
+over where the fill is large (a supernodal LU is faster there) or a chain falls apart within rounding.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from erl_torch import kernels
+from erl_torch.mdp.chains import EPSILON, Elimination
+from erl_torch.solvers.eigenpair import LOG_POWER_STEPS, POWER_STEPS
+from erl_torch.solvers.problem import Problem
+
+
+@dataclass(frozen=True, eq=False)
+class NewtonPattern:
+    """A problem's transitions, merged over actions, on the pattern of its chains."""
+
+    indptr: np.ndarray  # of the transition matrix [n*A, n]
+    log_p: np.ndarray  # of its entries
+    slot: np.ndarray  # place of each of its entries in the chain's
+    elimination: Elimination
+
+    @classmethod
+    def of(cls, problem: Problem) -> NewtonPattern | None:
+        """None where the problem is too large or its factors fill too much."""
+        if not problem.elimination.fits:
+            return None
+        p = problem.transition
+        return cls(p.indptr, np.log(p.data), problem.pattern[2], problem.elimination)
+
+    def eigenvector(
+        self, log_weight: np.ndarray, ref: int, rtol: float, max_steps: int
+    ) -> tuple[np.ndarray, tuple[float, float], int] | None:
+        """(h, bounds on log rho, Newton steps) for M(s, s') = sum_a exp(log_weight(s, a)) p(s'|s, a).
+
+        log_weight [n, A]; ``ref`` is a state to cut chains at. None where the iteration fails.
+        """
+        e = self.elimination
+        log_m = np.empty(e.ind.size)
+        kernels.merge_log_weights(self.indptr, self.log_p, log_weight, self.slot, e.ptr, log_m)
+        h = np.zeros(len(e.rank))
+        converged, low, high, steps = kernels.newton_perron(
+            e.ptr, e.ind, e.rank, *e.lu, log_m, h, ref, rtol, max_steps, POWER_STEPS, LOG_POWER_STEPS
+        )
+        if not converged:
+            return None
+        terms = int(np.diff(e.ptr).max()) + log_weight.shape[1]  # of the sums over successors and actions
+        slack = EPSILON * (terms + 8 * (1 + np.abs(h).max() + max(abs(low), abs(high))))
+        return h, (low - slack, high + slack), steps
