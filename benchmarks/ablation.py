@@ -20,9 +20,9 @@ from tqdm import tqdm
 
 from erl_torch import CertaintyEquivalence, EfficientS1, collect, solve_soft_bellman
 from erl_torch.envs.windy_cliff import WindyCliffEnv
-from erl_torch.evaluation import kl_per_state, objective
 from erl_torch.files import write_json
 from erl_torch.learners.efficient_s1.algorithm import SWITCHES
+from erl_torch.solvers.policy import kl_per_state, objective
 
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
 BETA = 10.0

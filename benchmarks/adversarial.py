@@ -35,9 +35,10 @@ from many_digits import KINDS, Given, NoRateError, Oracle, Rate, policies, probl
 from mpmath import mp, mpf  # noqa: E402
 
 from erl_torch import InputError, TabularMDP, certify, evaluation, solve_biasing, solve_soft_bellman  # noqa: E402
+from erl_torch.solvers import policy as exact_policy
 
 try:
-    from erl_torch.mdp import certificates
+    from erl_torch.solvers import certificates
 except ImportError:  # an earlier package
     certificates = None  # type: ignore[assignment]
 
@@ -164,7 +165,7 @@ def certified(out: dict[str, Any], oracle: Oracle, mdp: TabularMDP, rate: Rate, 
             if size > oracle.rounding:
                 _wrong(out, f"objective of {name}", f"{j} leaves out {mp.nstr(worth, 17)}", size)
             routes = {
-                "evaluation.objective": evaluation.objective(mdp, policy, total, given.beta),
+                "exact_policy.objective": exact_policy.objective(mdp, policy, total, given.beta),
                 "Judge.objective": judge.objective(policy, given.beta),
             }
             for route, found in routes.items():

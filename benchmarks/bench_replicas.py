@@ -32,9 +32,10 @@ from bench_s1 import medians
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from erl_torch import AlgorithmS1, CertaintyEquivalence, EfficientS1, Replicas, Simulation, TabularMDP, collect, kernels
+from erl_torch import AlgorithmS1, CertaintyEquivalence, EfficientS1, Replicas, Simulation, TabularMDP, collect
 from erl_torch.envs.windy_cliff import WindyCliffEnv
 from erl_torch.experience.sampling import Sampler
+from erl_torch.learners.s1 import kernels
 from erl_torch.learners.s1.lanes import ROWS, Engine, Lanes
 from erl_torch.rng import streams
 

@@ -26,12 +26,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from erl_torch import AlgorithmS1, CertaintyEquivalence, EfficientS1, Transitions, collect, kernels
+from erl_torch import AlgorithmS1, CertaintyEquivalence, EfficientS1, Transitions, collect
 from erl_torch.empirical import reservations
 from erl_torch.envs.windy_cliff import WindyCliffEnv
 from erl_torch.experience.recording import ColumnWriter, open_recording
 from erl_torch.experience.transitions import Recording
-from erl_torch.learners.s1 import listing
+from erl_torch.learners.s1 import kernels, listing
 from erl_torch.learners.s1.algorithm import S1Stream
 
 ROOT = Path(__file__).parents[1]

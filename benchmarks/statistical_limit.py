@@ -38,8 +38,8 @@ from erl_torch import (
     theta_uncertainty,
 )
 from erl_torch.envs.windy_cliff import WindyCliffEnv
-from erl_torch.evaluation import kl_per_state, objective
 from erl_torch.files import write_json
+from erl_torch.solvers.policy import kl_per_state, objective
 
 ROOT = Path(__file__).parents[1]
 CLIFF = WindyCliffEnv().mdp

@@ -20,11 +20,12 @@ if TYPE_CHECKING:
     from erl_torch.experience.collect import collect, record
     from erl_torch.experience.recording import FileRecording, open_recording, save_columns
     from erl_torch.experience.rollouts import collect_rollouts, rollout
+    from erl_torch.experience.simulation import Simulation
     from erl_torch.experience.transitions import Recording, Transitions
     from erl_torch.learners.certainty_equivalence import CertaintyEquivalence
     from erl_torch.learners.efficient_s1.algorithm import EfficientS1
     from erl_torch.learners.learner import NonFiniteError
-    from erl_torch.learners.replicas import Replicas, ReplicaSolution, Simulation
+    from erl_torch.learners.replicas import Replicas, ReplicaSolution
     from erl_torch.learners.s1.algorithm import AlgorithmS1, ListedS1, S1State
     from erl_torch.mdp.from_gymnasium import MeanRewardWarning, tabular_mdp
     from erl_torch.mdp.tabular import TabularMDP

@@ -13,16 +13,18 @@ import gymnasium as gym
 import numpy as np
 import scipy.sparse as sp
 
-from erl_torch import checks, kernels
+from erl_torch import checks
 from erl_torch.checks import InputError
+from erl_torch.experience import kernels as experience_kernels
 from erl_torch.experience.collect import batched, reset
 from erl_torch.experience.sampling import policy_cdf, sampling_tables
-from erl_torch.mdp import certificates, chains
-from erl_torch.mdp.certificates import one_step_worth, policy_gains
-from erl_torch.mdp.chains import GTH_STATES, classes, long_run
 from erl_torch.mdp.from_gymnasium import known_mdp, sizes
 from erl_torch.mdp.tabular import TabularMDP, check_policy, check_prior
 from erl_torch.rng import Streams
+from erl_torch.solvers import kernels as solvers_kernels
+from erl_torch.solvers.certificates import one_step_worth, policy_gains
+from erl_torch.solvers.chains import GTH_STATES, classes
+from erl_torch.solvers.policy import kl_per_state, objective, reward_per_step
 
 
 class Evaluation(NamedTuple):
@@ -31,62 +33,6 @@ class Evaluation(NamedTuple):
     mean_return: float  # undiscounted return of an episode, mean over sampled episodes
     reward_per_step: float  # exact over the horizon where the model is known, else sampled
     objective: float  # stationary reward rate - KL/beta, as ``objective``, where the model is known; else sampled
-
-
-class PolicyChain(NamedTuple):
-    """The Markov chain that a policy makes of an MDP."""
-
-    transition: sp.csr_array  # [S, S]
-    reward: np.ndarray  # [S]
-
-
-def policy_chain(mdp: TabularMDP, policy: np.ndarray) -> PolicyChain:
-    """The chain of ``policy`` [S, A]."""
-    return PolicyChain(chains.policy_chain(mdp.transition, policy), (policy * mdp.reward).sum(1))
-
-
-def kl_per_state(policy: np.ndarray, prior: np.ndarray) -> np.ndarray:
-    """KL(policy(.|s) || prior(.|s)) in nats, [S]; infinite where the policy leaves the prior's support."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        terms = np.where(policy > 0, policy * np.log(policy / prior), 0.0)
-    return terms.sum(1)  # type: ignore[no-any-return]
-
-
-def reward_per_step(mdp: TabularMDP, policy: np.ndarray, horizon: int) -> float:
-    """Expected undiscounted return of ``horizon`` steps from the start distribution, divided by ``horizon``."""
-    chain = policy_chain(mdp, policy)
-    p = chain.transition
-    total = kernels.finite_horizon_return(p.indptr, p.indices, p.data, chain.reward, mdp.start, horizon)
-    return float(total) / horizon
-
-
-def stationary_distribution(transition: sp.csr_array, start: np.ndarray) -> np.ndarray:
-    """Long-run share of time in each state, from ``start`` [S]; chain as CSR [S, S].
-
-    Periodic chains and chains with several closed classes are fine: each class counts by the probability
-    of ending in it. No digit is lost where the chain rarely moves between its parts (``erl_torch.mdp.chains``).
-    """
-    return long_run(transition, start).of_state
-
-
-def induced_distribution(mdp: TabularMDP, policy: np.ndarray, horizon: int | None = None) -> np.ndarray:
-    """Share of time in each state [S] under ``policy``: in the long run, or over ``horizon`` steps from the start."""
-    chain = policy_chain(mdp, policy).transition
-    if horizon is None:
-        return stationary_distribution(chain, mdp.start)
-    share, now, backward = np.zeros(mdp.n_states), mdp.start, sp.csr_array(chain.T)
-    for _ in range(horizon):
-        share, now = share + now, backward @ now
-    return share / horizon
-
-
-def objective(mdp: TabularMDP, policy: np.ndarray, prior: np.ndarray, beta: float) -> float:
-    """J(pi): stationary reward rate minus KL/beta, from the start distribution; reward a step.
-
-    Exact but for rounding, unless products of probabilities underflow: then it is somewhere between the bounds that
-    ``certificates.objective`` has beside the same figure.
-    """
-    return certificates.objective(mdp.transition, mdp.reward, prior, beta, policy, mdp.start).value
 
 
 def evaluate(
@@ -136,7 +82,7 @@ def evaluate(
         played = mean_return(table)
     elif known is not None and endless:
         returns = np.empty(n_episodes)
-        kernels.simulate_returns(*sampling_tables(known), policy_cdf(table), horizon, rng, returns)
+        experience_kernels.simulate_returns(*sampling_tables(known), policy_cdf(table), horizon, rng, returns)
         played = float(returns.mean())
     else:
         assert not isinstance(source, TabularMDP)
@@ -177,14 +123,16 @@ class Judge:
         """As the function of that name, for a policy [S, A]."""
         reward = (policy * self.mdp.reward).sum(1)
         chain = self._chain(policy)
-        total = kernels.finite_horizon_return(self._rows, self._columns, chain, reward, self.mdp.start, self.horizon)
+        total = solvers_kernels.finite_horizon_return(
+            self._rows, self._columns, chain, reward, self.mdp.start, self.horizon
+        )
         return float(total) / self.horizon
 
     def objective(self, policy: np.ndarray, beta: float) -> float:
         """As the function of that name."""
         if self._small and (policy > 0).all():
             chain = sp.csr_array((self._chain(policy), self._columns, self._rows))
-            share, sound = kernels.gth(chain[self._inside][:, self._inside].toarray())
+            share, sound = solvers_kernels.gth(chain[self._inside][:, self._inside].toarray())
             parts = (self.mdp.transition, self.mdp.reward, self.prior, beta, policy)
             gains = policy_gains(*parts, np.zeros(len(policy)))
             if sound and np.isfinite(gains).all() and np.abs(policy.sum(1) - 1).max() <= 2e-15:
@@ -194,7 +142,7 @@ class Judge:
     def _chain(self, policy: np.ndarray) -> np.ndarray:
         chain = np.empty(len(self._columns))
         p = self.mdp.transition
-        kernels.chain_of(p.data, self._place, policy.reshape(-1), p.indptr, chain)
+        solvers_kernels.chain_of(p.data, self._place, policy.reshape(-1), p.indptr, chain)
         return chain
 
 

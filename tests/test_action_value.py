@@ -11,11 +11,13 @@ import torch
 from conftest import problems, random_stream
 from hypothesis import strategies as st
 
-from erl_torch import InputError, Status, TabularMDP, Transitions, collect, kernels, solve_soft_bellman
+from erl_torch import InputError, Status, TabularMDP, Transitions, collect, solve_soft_bellman
 from erl_torch.envs.windy_cliff import WindyCliffEnv
 from erl_torch.learners import LEARNERS, DifferentialSoftQ, QLearning, RVISoftQ, Sarsa, SoftQ, ULearning, ZLearning
-from erl_torch.mdp.chains import RegenerativeLU
+from erl_torch.learners.action_value import kernels as action_value_kernels
 from erl_torch.run.comparison import measure, optimum
+from erl_torch.solvers import kernels as solvers_kernels
+from erl_torch.solvers.chains import RegenerativeLU
 
 AVERAGE = (DifferentialSoftQ, RVISoftQ)
 OPTIMISTIC = (ULearning, ZLearning)
@@ -134,7 +136,7 @@ def test_log_mix(x, step):
         expected = step * x
     else:
         expected = np.logaddexp(math.log1p(-step), math.log(step) + x)
-    assert kernels.log_mix(x, step) == pytest.approx(expected, rel=1e-6, abs=1e-24)
+    assert action_value_kernels.log_mix(x, step) == pytest.approx(expected, rel=1e-6, abs=1e-24)
 
 
 # -- fixed points -----------------------------------------------------------------------------------------
@@ -368,7 +370,7 @@ def test_learners_share_one_interface(cliff, name):
 
 def test_gth_and_lu_are_the_stationary_distribution():
     p = np.random.default_rng(0).dirichlet(np.ones(9), size=9)
-    for found in (RegenerativeLU(sp.csr_array(p), 0).stationary(), kernels.gth(p.copy())[0]):
+    for found in (RegenerativeLU(sp.csr_array(p), 0).stationary(), solvers_kernels.gth(p.copy())[0]):
         np.testing.assert_allclose(found, oracle.stationary(p), rtol=1e-12)
 
 
@@ -376,4 +378,4 @@ def test_gth_and_lu_are_the_stationary_distribution():
 def test_gth_keeps_digits_where_the_chain_nearly_falls_apart(leave):
     """Two pairs of states, joined both ways by ``leave`` and 3 ``leave``: shares 3/4 and 1/4."""
     p = np.array([[0.5, 0.5, 0, 0], [0.5, 0.5, leave, 0], [0, 3 * leave, 0.5, 0.5], [0, 0, 0.5, 0.5]])
-    np.testing.assert_allclose(kernels.gth(p)[0], [0.375, 0.375, 0.125, 0.125], rtol=2 * leave + 1e-14)
+    np.testing.assert_allclose(solvers_kernels.gth(p)[0], [0.375, 0.375, 0.125, 0.125], rtol=2 * leave + 1e-14)

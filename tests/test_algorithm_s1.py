@@ -11,9 +11,10 @@ import torch
 from conftest import overshooting, problems, random_mdp, random_policy, random_stream
 from hypothesis import strategies as st
 
-from erl_torch import AlgorithmS1, InputError, ListedS1, NonFiniteError, Solution, Status, Transitions, collect, kernels
+from erl_torch import AlgorithmS1, InputError, ListedS1, NonFiniteError, Solution, Status, Transitions, collect
 from erl_torch.empirical.counts import tally
 from erl_torch.envs.windy_cliff import WindyCliffEnv
+from erl_torch.learners.s1 import kernels
 
 IMPLEMENTATIONS = ("fast", "literal")
 

@@ -20,7 +20,7 @@ from erl_torch import (
     solve_soft_bellman,
 )
 from erl_torch.envs.windy_cliff import WindyCliffEnv
-from erl_torch.evaluation import objective
+from erl_torch.solvers.policy import objective
 
 CLIFF = WindyCliffEnv().mdp
 

@@ -11,11 +11,11 @@ from matplotlib.image import imread
 
 from erl_torch import AlgorithmS1, InputError, TabularMDP, collect, pictures, solve_soft_bellman
 from erl_torch.cli import main as cli
-from erl_torch.evaluation import objective
 from erl_torch.learners import LEARNERS, DifferentialSoftQ, SoftQ
 from erl_torch.run import settings as schemas
 from erl_torch.run.comparing import run_comparison
 from erl_torch.run.comparison import MEASURES, compare, interquartile_mean, iqm_interval, measure, optimum
+from erl_torch.solvers.policy import objective
 
 SMALL = ("experience.n_episodes=4", "experience.episode_length=500", "seeds=2", "n_sizes=2")
 PAIR = "learners=[differential_soft_q,soft_q]"

@@ -26,14 +26,14 @@ from erl_torch import (
     Transitions,
     collect,
     empirical_mdp,
-    kernels,
     solve_soft_bellman,
 )
 from erl_torch.envs.windy_cliff import WindyCliffEnv
-from erl_torch.evaluation import kl_per_state, objective
 from erl_torch.experience.transitions import COLUMNS
+from erl_torch.learners.efficient_s1 import kernels
 from erl_torch.learners.efficient_s1.algorithm import SWITCHES, certificate, swept
 from erl_torch.learners.s1 import listing
+from erl_torch.solvers.policy import kl_per_state, objective
 from erl_torch.solvers.problem import Problem
 
 CLIFF = WindyCliffEnv().mdp

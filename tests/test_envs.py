@@ -18,8 +18,8 @@ from erl_torch.envs.grid_world import GridWorld, uniform_wind
 from erl_torch.envs.shift import dynamics_shift
 from erl_torch.envs.tabular import TabularEnv
 from erl_torch.envs.windy_cliff import WindyCliffEnv
-from erl_torch.evaluation import reward_per_step
 from erl_torch.mdp.from_gymnasium import sizes
+from erl_torch.solvers.policy import reward_per_step
 
 IDS = sorted(ENTRY_POINTS)
 MODELS = [env_id for env_id in IDS if env_id not in CONTROL_ENTRY_POINTS]  # the others: test_control.py
@@ -236,7 +236,7 @@ def test_maps_lead_from_start_to_goal(name):
     mdp = windy_frozen_lake(name)
     best = erl_torch.solve_soft_bellman(mdp, 20.0)
     goal = "".join(MAPS[name]).index("G")
-    share = erl_torch.evaluation.induced_distribution(mdp, best.policy.numpy())
+    share = erl_torch.solvers.policy.induced_distribution(mdp, best.policy.numpy())
     assert share[goal] > 0.01
     assert reward_per_step(mdp, best.policy.numpy(), 1000) > reward_per_step(
         mdp, np.full((mdp.n_states, 4), 0.25), 1000

@@ -9,13 +9,7 @@ from conftest import random_mdp, random_policy
 
 from erl_torch import TabularMDP, evaluate
 from erl_torch.envs.windy_cliff import WindyCliffEnv
-from erl_torch.evaluation import (
-    kl_per_state,
-    objective,
-    policy_chain,
-    reward_per_step,
-    stationary_distribution,
-)
+from erl_torch.solvers.policy import kl_per_state, objective, policy_chain, reward_per_step, stationary_distribution
 
 CLIFF = WindyCliffEnv().mdp
 UNIFORM = np.full((15, 4), 0.25)

@@ -8,7 +8,7 @@ from scipy.stats import t as student
 from erl_torch import Transitions, empirical_mdp, policy_uncertainty, theta_uncertainty
 from erl_torch.empirical import uncertainty
 from erl_torch.empirical.uncertainty import _luck, _with_successor, _Worth
-from erl_torch.mdp.chains import SingularChainError
+from erl_torch.solvers.chains import SingularChainError
 
 BUDGET = 1.92
 

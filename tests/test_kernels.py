@@ -5,10 +5,14 @@ import math
 import numpy as np
 import pytest
 
-from erl_torch import TabularMDP, Transitions, kernels
+from erl_torch import TabularMDP, Transitions
 from erl_torch.empirical.counts import tally
-from erl_torch.evaluation import Judge, reward_per_step
+from erl_torch.envs import kernels as envs_kernels
+from erl_torch.evaluation import Judge
+from erl_torch.experience import kernels as experience_kernels
 from erl_torch.experience.sampling import _levels, _words, policy_cdf, sampling_tables
+from erl_torch.learners.efficient_s1 import kernels as efficient_s1_kernels
+from erl_torch.solvers.policy import reward_per_step
 
 BELOW_1 = math.nextafter(1.0, 0.0)
 
@@ -18,17 +22,17 @@ def test_draws_are_of_half_open_intervals(x):
     """Entry m is drawn for x in [cdf[m - 1], cdf[m]): never one of probability 0, also at the edges."""
     cdf = np.array([9.0, 9.0, 0.0, 0.25, 0.25, 0.5, 0.5, 1.0, 9.0])  # a row at 2..8
     expected = 2 + np.searchsorted(cdf[2:8], x, side="right")
-    assert kernels._draw(cdf, 2, 8, x) == expected
+    assert experience_kernels._draw(cdf, 2, 8, x) == expected
     low, length = np.full(5, 2, np.uint64), np.full(5, 6, np.uint64)
-    kernels._draw_lanes(cdf, low, length, _levels(6), np.full(5, x))
+    experience_kernels._draw_lanes(cdf, low, length, _levels(6), np.full(5, x))
     assert (low == expected).all()
 
 
 def test_uniforms_are_numpys_to_the_last_bit():
     generators = [np.random.default_rng(seed) for seed in range(3)]
     state, out = _words(generators), np.empty((500, 3))
-    kernels._uniforms(state, out[:200], 200)
-    kernels._uniforms(state, out[200:], 300)
+    experience_kernels._uniforms(state, out[:200], 200)
+    experience_kernels._uniforms(state, out[200:], 300)
     assert np.array_equal(out, np.stack([generator.random(500) for generator in generators], axis=1))
 
 
@@ -36,7 +40,7 @@ def test_lanes_draw_from_rows_of_any_length():
     for n in range(1, 70):
         middles = np.tile((np.arange(n) + 0.5) / n, 4)
         low, length = np.zeros(4 * n, np.uint64), np.full(4 * n, n, np.uint64)
-        kernels._draw_lanes(np.arange(1, n + 1) / n, low, length, _levels(n), middles)
+        experience_kernels._draw_lanes(np.arange(1, n + 1) / n, low, length, _levels(n), middles)
         assert np.array_equal(low, np.tile(np.arange(n), 4))
 
 
@@ -44,10 +48,10 @@ def test_rounding_reaches_no_entry_of_probability_0():
     """Ten times .1 is less than 1, by as much as the largest uniform number is."""
     data = np.array([0.1] * 10 + [0.0, 0.5, 0.5])
     assert sum(data[:10]) == BELOW_1
-    cdf = kernels.cumulative_rows(np.array([0, 11, 13]), data)
-    assert kernels._draw(cdf, 0, 11, BELOW_1) == 9
+    cdf = experience_kernels.cumulative_rows(np.array([0, 11, 13]), data)
+    assert experience_kernels._draw(cdf, 0, 11, BELOW_1) == 9
     low, length = np.zeros(4, np.uint64), np.full(4, 11, np.uint64)
-    kernels._draw_lanes(cdf, low, length, _levels(11), np.full(4, BELOW_1))
+    experience_kernels._draw_lanes(cdf, low, length, _levels(11), np.full(4, BELOW_1))
     assert (low == 9).all()
     assert cdf[11:].tolist() == [0.5, 1.0]
 
@@ -57,7 +61,7 @@ def test_returns_on_a_cycle_are_counted():
     mdp = TabularMDP(np.roll(np.eye(3), 1, 1)[:, None], [[1.0], [10.0], [100.0]], [1, 0, 0])
     policy = np.ones((3, 1))
     returns = np.zeros(2)
-    kernels.simulate_returns(*sampling_tables(mdp), policy_cdf(policy), 7, np.random.default_rng(0), returns)
+    experience_kernels.simulate_returns(*sampling_tables(mdp), policy_cdf(policy), 7, np.random.default_rng(0), returns)
     assert returns.tolist() == [223.0, 223.0]
     for rate in (reward_per_step(mdp, policy, 7), Judge(mdp, policy, 7).reward_per_step(policy)):
         assert 7 * rate == pytest.approx(223.0, rel=1e-15)
@@ -65,7 +69,7 @@ def test_returns_on_a_cycle_are_counted():
 
 def test_cells_are_counted_row_by_row():
     cells = np.random.default_rng(0).integers(9, size=(20, 6)).astype(np.int32)
-    length, indices, counts = kernels.count_rows(cells, 9)
+    length, indices, counts = envs_kernels.count_rows(cells, 9)
     expected = [np.unique(row, return_counts=True) for row in cells]
     assert length.tolist() == [len(cell) for cell, _ in expected]
     assert np.array_equal(indices, np.concatenate([cell for cell, _ in expected]))
@@ -91,4 +95,4 @@ def test_log_blend(log_new, step):
         expected = log_new
         if step < 1.0:
             expected = np.logaddexp(math.log1p(-step) + log_x, math.log(step) + log_new)
-        assert kernels._log_blend(log_x, log_new, step) == pytest.approx(expected, rel=1e-9, abs=1e-11)
+        assert efficient_s1_kernels._log_blend(log_x, log_new, step) == pytest.approx(expected, rel=1e-9, abs=1e-11)

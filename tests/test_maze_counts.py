@@ -7,11 +7,13 @@ import pytest
 import scipy.sparse as sp
 from test_solvers import kl, maze
 
-from erl_torch import Status, TabularMDP, kernels, solve_biasing, solve_soft_bellman
+from erl_torch import Status, TabularMDP, solve_biasing, solve_soft_bellman
 from erl_torch.envs.mazes import random_mazes
 from erl_torch.reproduction import figure_s1, table_s1
+from erl_torch.reproduction import kernels as reproduction_kernels
 from erl_torch.reproduction.artifact import NOT_REPRODUCED, REPRODUCED
 from erl_torch.reproduction.mazes import MAX_ITERATIONS, count_by_power_iteration, count_cell
+from erl_torch.solvers import kernels as solvers_kernels
 from erl_torch.solvers.biasing import iterate_biasing
 from erl_torch.solvers.newton import NewtonPattern
 from erl_torch.solvers.problem import Problem
@@ -36,7 +38,7 @@ def one_maze(size, density, wind_level, seed, i):
 def test_compiled_eigenvectors_are_the_general_ones(cell, beta, monkeypatch):
     mdp = one_maze(*cell)
     compiled = solve_biasing(mdp, beta, stop="kl")
-    monkeypatch.setattr("erl_torch.mdp.chains.SPARSE_STATES", 0)
+    monkeypatch.setattr("erl_torch.solvers.chains.SPARSE_STATES", 0)
     general = solve_biasing(mdp, beta, stop="kl")
     assert compiled.k == general.k
     assert compiled.theta == pytest.approx(general.theta, abs=1e-12)
@@ -81,7 +83,7 @@ def test_lu_pattern_holds_the_factors():
     a = (rng.random((n, n)) < 0.08) * rng.random((n, n))
     csr = sp.csr_array(a)
     rank = rng.permutation(n).astype(np.int32)
-    lptr, lind, uptr, uind = kernels.lu_pattern(csr.indptr.astype(np.int64), csr.indices.astype(np.int32), rank)
+    lptr, lind, uptr, uind = solvers_kernels.lu_pattern(csr.indptr.astype(np.int64), csr.indices.astype(np.int32), rank)
     dense = np.eye(n) * (1 + a.sum(1))
     dense[np.ix_(rank, rank)] -= np.where((a > 0) | (a.T > 0), 0.01 + rng.random((n, n)), 0.0)
     dense += 40 * np.eye(n)
@@ -123,7 +125,9 @@ def test_power_iteration_is_the_plain_one(tolerance, max_steps):
     mdp, beta = one_maze(6, 0.2, 2.0, 0, 0), 3.0
     problem = Problem.of(mdp, beta)
     p, log_weight = problem.transition, beta * problem.reward.ravel()
-    chi, steps, converged = kernels.capped_power(p.indptr, p.indices, p.data, log_weight, beta, tolerance, max_steps)
+    chi, steps, converged = reproduction_kernels.capped_power(
+        p.indptr, p.indices, p.data, log_weight, beta, tolerance, max_steps
+    )
     expected_chi, expected_steps, expected_converged = plain_power(
         p.toarray(), np.exp(log_weight), beta, tolerance, max_steps
     )

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from erl_torch import InputError, kernels
+from erl_torch import InputError
+from erl_torch.envs import kernels
 from erl_torch.envs.mazes import random_maze, random_mazes
 
 

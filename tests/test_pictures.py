@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from erl_torch import pictures
+from erl_torch.envs import grid_pictures
 from erl_torch.envs.grid_world import GridWorld, uniform_wind
 from erl_torch.envs.windy_cliff import WindyCliffEnv
 
@@ -12,7 +13,7 @@ LARGE = GridWorld(("S" + "F" * 29,) + ("F" * 30,) * 29, uniform_wind(1.0, 0.5))
 
 
 @pytest.mark.parametrize("grid", [GRID, LARGE, None], ids=["cliff", "30x30", "table"])
-@pytest.mark.parametrize("draw", [pictures.policy_picture, pictures.bias_picture])
+@pytest.mark.parametrize("draw", [grid_pictures.policy_picture, grid_pictures.bias_picture])
 def test_size_and_type(draw, grid):
     n_states = 15 if grid is None else grid.tiles.size
     picture = draw(np.full((n_states, 4), 0.25), grid, "title")
@@ -33,8 +34,8 @@ def test_arrows_point_where_the_policy_goes():
     for action, (axis, sign) in enumerate([(1, -1), (0, 1), (1, 1), (0, -1)]):
         policy = np.zeros((9, 4))
         policy[4, action] = 1
-        pixels = np.argwhere(blue(pictures.policy_picture(policy, grid)))
-        height, width = pictures.policy_picture(policy, grid).shape[:2]
+        pixels = np.argwhere(blue(grid_pictures.policy_picture(policy, grid)))
+        height, width = grid_pictures.policy_picture(policy, grid).shape[:2]
         px = (height - 30) / 3
         centre = np.array([24 + 1.5 * px, width / 2])
         assert width >= height - 24
@@ -45,14 +46,14 @@ def test_arrows_point_where_the_policy_goes():
 
 def test_traps_and_goal_have_no_arrows():
     grid = GridWorld(("HG", "SR"))
-    assert not blue(pictures.policy_picture(np.vstack([np.full((2, 4), 0.25), np.zeros((2, 4))]), grid)).any()
+    assert not blue(grid_pictures.policy_picture(np.vstack([np.full((2, 4), 0.25), np.zeros((2, 4))]), grid)).any()
 
 
 def test_bias_colours_follow_the_values():
     flat, peaked = np.zeros((15, 4)), np.zeros((15, 4))
     peaked[7, 2] = 1.0
-    change = np.argwhere((pictures.bias_picture(flat, GRID) != pictures.bias_picture(peaked, GRID)).any(-1))
-    width = pictures.bias_picture(flat, GRID).shape[1] - 80  # without the colour bar
+    change = np.argwhere((grid_pictures.bias_picture(flat, GRID) != grid_pictures.bias_picture(peaked, GRID)).any(-1))
+    width = grid_pictures.bias_picture(flat, GRID).shape[1] - 80  # without the colour bar
     grid_part = change[change[:, 1] < 200]
     px = (400 - 30) / 5
     centre = 24 + 2.5 * px, (6 + width) / 2  # state 7: row 2, col 1
@@ -61,9 +62,9 @@ def test_bias_colours_follow_the_values():
 
 
 def test_agent_is_drawn_where_it_stands():
-    board = pictures.board(GRID)
+    board = grid_pictures.board(GRID)
     for cell in [(0, 0), (4, 1)]:
-        change = np.argwhere((pictures.with_agent(board, GRID.shape, cell) != board).any(-1))
+        change = np.argwhere((grid_pictures.with_agent(board, GRID.shape, cell) != board).any(-1))
         np.testing.assert_allclose(change.mean(0), (np.array(cell) + 0.5) * 64 - 0.5, atol=1)
 
 

@@ -26,17 +26,18 @@ from erl_torch import (
     Status,
     Transitions,
     collect,
-    kernels,
     pictures,
     solve_soft_bellman,
 )
 from erl_torch.empirical.counts import tally
-from erl_torch.evaluation import Judge, objective, reward_per_step
+from erl_torch.evaluation import Judge
 from erl_torch.experience.sampling import Sampler
+from erl_torch.experience.simulation import tuples_of
 from erl_torch.learners import LEARNERS
-from erl_torch.learners.replicas import tuples_of
+from erl_torch.learners.s1 import kernels
 from erl_torch.rng import streams
 from erl_torch.run.training import train
+from erl_torch.solvers.policy import objective, reward_per_step
 
 ROOT = Path(__file__).parents[1]
 N = 7  # replicas

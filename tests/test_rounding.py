@@ -17,17 +17,17 @@ from erl_torch import (
     TabularMDP,
     certify,
     iterate_biasing,
-    kernels,
     perron,
     solve_biasing,
     solve_soft_bellman,
 )
 from erl_torch.evaluation import Judge
-from erl_torch.evaluation import objective as worth
-from erl_torch.mdp.certificates import gains, objective, policy_gains
-from erl_torch.mdp.chains import RegenerativeLU, SingularChainError, long_run
 from erl_torch.notes import Note
 from erl_torch.solution import proven
+from erl_torch.solvers import kernels
+from erl_torch.solvers.certificates import gains, objective, policy_gains
+from erl_torch.solvers.chains import RegenerativeLU, SingularChainError, long_run
+from erl_torch.solvers.policy import objective as worth
 
 
 @pytest.fixture(autouse=True)
@@ -307,7 +307,7 @@ def test_indices_out_of_range_are_named(layout):
 
 
 def test_states_that_are_never_left_do_not_reach_superlu(monkeypatch):
-    monkeypatch.setattr("erl_torch.mdp.chains.SPARSE_STATES", 0)
+    monkeypatch.setattr("erl_torch.solvers.chains.SPARSE_STATES", 0)
     chain = sp.csr_array(np.array([[0.5, 0.5, 0.0], [0.0, 1.0, 0.0], [0.5, 0.0, 0.5]]))
     with pytest.raises(SingularChainError, match="state 1 is never left"):
         RegenerativeLU(chain, 0)

@@ -20,18 +20,16 @@ from erl_torch import (
     TabularMDP,
     certify,
     iterate_biasing,
-    kernels,
     perron,
     solve_biasing,
     solve_soft_bellman,
 )
 from erl_torch.envs.windy_cliff import WindyCliffEnv
-from erl_torch.evaluation import induced_distribution, kl_per_state, objective, policy_chain, reward_per_step
 from erl_torch.learners import Exact
-from erl_torch.mdp import chains
-from erl_torch.mdp.chains import RegenerativeLU, SingularChainError, classes, reachable_from
-from erl_torch.solvers import eigenpair
+from erl_torch.solvers import chains, eigenpair, kernels
+from erl_torch.solvers.chains import RegenerativeLU, SingularChainError, classes, reachable_from
 from erl_torch.solvers.eigenpair import REFUSALS
+from erl_torch.solvers.policy import induced_distribution, kl_per_state, objective, policy_chain, reward_per_step
 from erl_torch.solvers.problem import Problem
 
 CLIFF = WindyCliffEnv().mdp

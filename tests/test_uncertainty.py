@@ -16,15 +16,14 @@ from erl_torch import (
     bootstrap_theta,
     collect,
     empirical_mdp,
-    kernels,
     policy_uncertainty,
     solve_soft_bellman,
     theta_uncertainty,
 )
-from erl_torch.empirical import uncertainty
+from erl_torch.empirical import kernels, uncertainty
 from erl_torch.empirical.uncertainty import _multinomial
 from erl_torch.envs.windy_cliff import WindyCliffEnv
-from erl_torch.evaluation import objective
+from erl_torch.solvers.policy import objective
 
 CLIFF = WindyCliffEnv().mdp
 UNIFORM = np.full((15, 4), 0.25)

@@ -21,11 +21,12 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from erl_torch import checks, kernels
+from erl_torch import checks
 from erl_torch.checks import InputError
+from erl_torch.empirical import kernels
 from erl_torch.experience.transitions import Recording
-from erl_torch.mdp.chains import classes
 from erl_torch.mdp.tabular import check_prior, normalise_rows
+from erl_torch.solvers.chains import classes
 from erl_torch.solvers.problem import Problem
 
 BLOCK = 1 << 16  # tuples at a time: they stay in the processor's cache

@@ -24,9 +24,9 @@ from erl_torch.checks import InputError
 from erl_torch.empirical.counts import EmpiricalMDP, Tally, empirical_mdp, tally
 from erl_torch.empirical.uncertainty import Estimate
 from erl_torch.experience.transitions import Recording, Transitions
-from erl_torch.mdp.chains import reachable_from
 from erl_torch.mdp.tabular import TabularMDP
 from erl_torch.solution import Status, proven
+from erl_torch.solvers.chains import reachable_from
 
 LEVEL = 1e-9  # chance, at most, that data as they should be are spoken of
 EXPECTED = 1.0  # draws, below which cells are pooled

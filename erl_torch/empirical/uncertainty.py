@@ -51,14 +51,15 @@ import numpy as np
 import scipy.sparse as sp
 from scipy import optimize, special
 
-from erl_torch import checks, kernels
+from erl_torch import checks
 from erl_torch.checks import InputError
+from erl_torch.empirical import kernels
 from erl_torch.empirical.counts import EmpiricalMDP, EmpiricalProblem
-from erl_torch.evaluation import kl_per_state
-from erl_torch.mdp.certificates import soft_backup
-from erl_torch.mdp.chains import SingularChainError
 from erl_torch.mdp.tabular import check_policy
 from erl_torch.solution import Status
+from erl_torch.solvers.certificates import soft_backup
+from erl_torch.solvers.chains import SingularChainError
+from erl_torch.solvers.policy import kl_per_state
 from erl_torch.solvers.problem import Problem
 from erl_torch.solvers.soft_bellman import solve_problem
 

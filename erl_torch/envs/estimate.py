@@ -27,7 +27,8 @@ import scipy.sparse as sp
 import torch
 from tqdm import tqdm
 
-from erl_torch import checks, kernels
+from erl_torch import checks
+from erl_torch.envs import kernels
 from erl_torch.envs.control import ControlTask, control_task
 from erl_torch.envs.discretise import UniformBins
 from erl_torch.files import read_npz, write_npz

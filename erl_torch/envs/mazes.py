@@ -18,8 +18,9 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.special import betaincinv, ndtri
 
-from erl_torch import checks, kernels
+from erl_torch import checks
 from erl_torch.checks import InputError
+from erl_torch.envs import kernels
 from erl_torch.envs.grid_world import GridWorld
 
 SWEEPS = 5

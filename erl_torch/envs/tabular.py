@@ -8,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 
 from erl_torch.checks import InputError
+from erl_torch.envs import grid_pictures
 from erl_torch.envs.grid_world import GridWorld
 from erl_torch.mdp.tabular import TabularMDP
 
@@ -128,9 +129,8 @@ class GridWorldEnv(TabularEnv):
         scale: float = 3,
     ) -> np.ndarray:
         """A picture [height, width, 3] for print: tiles, wind, a policy [S, A], a distribution over states [S]."""
-        from erl_torch import pictures
 
-        return pictures.grid_picture(self.grid, policy, distribution, title, scale=scale)
+        return grid_pictures.grid_picture(self.grid, policy, distribution, title, scale=scale)
 
     def _render_text(self) -> str:
         cols = self.grid.shape[1]
@@ -141,8 +141,7 @@ class GridWorldEnv(TabularEnv):
         return "\n".join(lines) + "\n"
 
     def _render_picture(self) -> np.ndarray:
-        from erl_torch import pictures
 
         if self._board is None:
-            self._board = pictures.board(self.grid)
-        return pictures.with_agent(self._board, self.grid.shape, divmod(self.state, self.grid.shape[1]))
+            self._board = grid_pictures.board(self.grid)
+        return grid_pictures.with_agent(self._board, self.grid.shape, divmod(self.state, self.grid.shape[1]))

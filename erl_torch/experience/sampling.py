@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from erl_torch import kernels
+from erl_torch.experience import kernels
 from erl_torch.mdp.tabular import TabularMDP
 from erl_torch.rng import Streams
 

@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from erl_torch import checks, kernels
+from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.files import read_npz, write_npz
+from erl_torch.mdp import kernels
 from erl_torch.notes import note
 
 ROW_SUM_TOLERANCE = 1e-5  # single precision is welcome

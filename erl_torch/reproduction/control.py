@@ -17,8 +17,8 @@ import torch
 from erl_torch import estimate_mdp
 from erl_torch.envs.control import control_task
 from erl_torch.experience.rollouts import rollout
-from erl_torch.mdp.certificates import soft_backup
 from erl_torch.mdp.tabular import TabularMDP
+from erl_torch.solvers.certificates import soft_backup
 from erl_torch.solvers.problem import Problem
 from erl_torch.solvers.result import spread
 

@@ -9,10 +9,9 @@ import scipy.sparse as sp
 from matplotlib.figure import Figure
 
 from erl_torch import perron, solve_soft_bellman
+from erl_torch.envs.grid_pictures import draw_grid, shares
 from erl_torch.envs.windy_cliff import WindyCliffEnv
-from erl_torch.evaluation import induced_distribution, policy_chain, reward_per_step, stationary_distribution
 from erl_torch.mdp.tabular import TabularMDP
-from erl_torch.pictures import draw_grid, shares
 from erl_torch.reproduction.artifact import (
     NOT_REPRODUCED,
     ORACLE,
@@ -26,6 +25,7 @@ from erl_torch.reproduction.artifact import (
     compared,
     judged,
 )
+from erl_torch.solvers.policy import induced_distribution, policy_chain, reward_per_step, stationary_distribution
 
 HORIZON = 1000
 THETA = 0.9395271537

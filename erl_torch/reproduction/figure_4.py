@@ -11,10 +11,10 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from erl_torch import solve_biasing, solve_soft_bellman
+from erl_torch.envs.grid_pictures import draw_grid, shares
 from erl_torch.envs.shift import dynamics_shift
-from erl_torch.evaluation import induced_distribution, reward_per_step
-from erl_torch.pictures import draw_grid, shares
 from erl_torch.reproduction.artifact import ORACLE, Artifact, Comparison, Output, Results, Units, compared
+from erl_torch.solvers.policy import induced_distribution, reward_per_step
 
 HORIZON = 1000
 TOP = 0.4  # share of time at the end of the colours

@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 
 from erl_torch import AlgorithmS1, CertaintyEquivalence, EfficientS1, collect, iterate_biasing
 from erl_torch.envs.windy_cliff import WindyCliffEnv
-from erl_torch.evaluation import objective, reward_per_step
 from erl_torch.learners import DifferentialSoftQ
 from erl_torch.pictures import COLOURS
 from erl_torch.reproduction.artifact import (
@@ -25,6 +24,7 @@ from erl_torch.reproduction.artifact import (
     compared_samples,
 )
 from erl_torch.run.comparison import measure, optimum
+from erl_torch.solvers.policy import objective, reward_per_step
 
 BETA, HORIZON = 10.0, 1000
 N_EPOCHS, N_BIAS = 15, 6

@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from erl_torch import kernels
 from erl_torch.envs.mazes import random_mazes
 from erl_torch.mdp.tabular import TabularMDP
+from erl_torch.reproduction import kernels
 from erl_torch.solvers.biasing import KL_TOLERANCE, solve_biasing
 from erl_torch.solvers.problem import Problem
 

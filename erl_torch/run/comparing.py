@@ -16,10 +16,11 @@ import torch
 from omegaconf import DictConfig
 from tqdm import tqdm
 
-from erl_torch import checks, kernels, pictures
+from erl_torch import checks, pictures
 from erl_torch.checks import InputError
 from erl_torch.files import read_npy, write_json, write_png
 from erl_torch.learners import LEARNERS
+from erl_torch.learners.s1 import kernels
 from erl_torch.mdp.tabular import TabularMDP
 from erl_torch.notes import collected
 from erl_torch.run.comparison import compare

@@ -30,11 +30,11 @@ import torch
 
 from erl_torch import checks
 from erl_torch.checks import InputError
-from erl_torch.evaluation import kl_per_state, policy_chain, stationary_distribution
 from erl_torch.experience.collect import collect
 from erl_torch.mdp.tabular import TabularMDP, check_policy
 from erl_torch.solution import Solution, Status
 from erl_torch.solvers import solve_soft_bellman
+from erl_torch.solvers.policy import kl_per_state, policy_chain, stationary_distribution
 
 MEASURES = ("gap", "kl", "kl_states", "theta_error", "n_steps", "seconds")
 LEVEL = 0.95  # of the intervals

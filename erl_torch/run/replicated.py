@@ -34,11 +34,12 @@ from erl_torch.empirical.uncertainty import Estimate
 from erl_torch.evaluation import Judge, evaluate
 from erl_torch.experience.collect import COLUMN_BYTES, collect
 from erl_torch.experience.recording import check_target, save_columns
+from erl_torch.experience.simulation import KEEP_BYTES, TUPLE_BYTES, Experience, Simulation
 from erl_torch.experience.transitions import Transitions
 from erl_torch.files import read_npy, write_json, write_png
 from erl_torch.learners import Exact, NonFiniteError
 from erl_torch.learners.learner import columns
-from erl_torch.learners.replicas import KEEP_BYTES, TUPLE_BYTES, Experience, Replicas, ReplicaSolution, Simulation
+from erl_torch.learners.replicas import Replicas, ReplicaSolution
 from erl_torch.log.tensorboard import Board, hyperparameters, replica_layout
 from erl_torch.mdp.from_gymnasium import known_mdp, sizes
 from erl_torch.mdp.tabular import TabularMDP, check_policy

@@ -23,24 +23,25 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 import erl_torch
-from erl_torch import checks, kernels, pictures
+from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.empirical import reservations
 from erl_torch.empirical.counts import EmpiricalMDP
 from erl_torch.empirical.reservations import Reservation
 from erl_torch.empirical.uncertainty import Estimate, theta_uncertainty
+from erl_torch.envs import grid_pictures
 from erl_torch.envs.discretise import Discretise
 from erl_torch.envs.estimate import estimate_mdp
 from erl_torch.envs.grid_world import GridWorld
-from erl_torch.evaluation import Evaluation, evaluate, reward_per_step
+from erl_torch.evaluation import Evaluation, evaluate
 from erl_torch.experience.collect import collect, record
 from erl_torch.experience.recording import FileRecording, check_target, open_recording
 from erl_torch.experience.transitions import Recording
 from erl_torch.files import read_npy, write_json
 from erl_torch.learners import LEARNERS, Exact, ExactState, NonFiniteError, S1State
 from erl_torch.learners.learner import columns
+from erl_torch.learners.s1 import kernels
 from erl_torch.log.tensorboard import Board, hyperparameters, layout
-from erl_torch.mdp.chains import SingularChainError
 from erl_torch.mdp.from_gymnasium import MeanRewardWarning, absorbing, known_mdp, sizes, tabular_mdp
 from erl_torch.mdp.tabular import TabularMDP, check_policy
 from erl_torch.notes import collected, note
@@ -49,6 +50,8 @@ from erl_torch.run.checkpoint import Checkpoints, rows_of
 from erl_torch.run.settings import check_keys
 from erl_torch.solution import Solution, Status, proven
 from erl_torch.solvers import certify, solve_soft_bellman
+from erl_torch.solvers.chains import SingularChainError
+from erl_torch.solvers.policy import reward_per_step
 
 SafePoint = Callable[[], None]
 TABLES = 8  # of a learner's size, about, while it learns and is evaluated
@@ -759,11 +762,11 @@ class _Drawer:
         self.board, self.grid = board, grid
 
     def policy(self, state: Any, step: int, title: str) -> None:
-        self.board.picture("policy", pictures.policy_picture(state.policy.cpu().numpy(), self.grid, title), step)
+        self.board.picture("policy", grid_pictures.policy_picture(state.policy.cpu().numpy(), self.grid, title), step)
 
     def bias(self, state: Any, step: int, title: str) -> None:
         self.board.picture(
-            "reward_bias", pictures.bias_picture(state.reward_bias.cpu().numpy(), self.grid, title), step
+            "reward_bias", grid_pictures.bias_picture(state.reward_bias.cpu().numpy(), self.grid, title), step
         )
 
 

@@ -25,11 +25,12 @@ from typing import Any
 
 import numpy as np
 
-from erl_torch import checks, kernels
+from erl_torch import checks
 from erl_torch.checks import InputError
-from erl_torch.mdp.certificates import soft_backup
 from erl_torch.mdp.tabular import TabularMDP
 from erl_torch.solution import Solution, Status
+from erl_torch.solvers import kernels
+from erl_torch.solvers.certificates import soft_backup
 from erl_torch.solvers.eigenpair import solve_log_perron
 from erl_torch.solvers.newton import NewtonPattern
 from erl_torch.solvers.problem import Problem

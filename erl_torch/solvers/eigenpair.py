@@ -16,10 +16,11 @@ import numpy as np
 import scipy.sparse as sp
 import torch
 
-from erl_torch import checks, kernels
+from erl_torch import checks
 from erl_torch.checks import InputError
-from erl_torch.mdp.chains import EPSILON, Elimination, RegenerativeLU, SingularChainError, classes, likely_state
 from erl_torch.solution import Status
+from erl_torch.solvers import kernels
+from erl_torch.solvers.chains import EPSILON, Elimination, RegenerativeLU, SingularChainError, classes, likely_state
 
 POWER_STEPS = 300  # cheap ones, on the matrix itself
 LOG_POWER_STEPS = 40

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from erl_torch import kernels
-from erl_torch.mdp.chains import EPSILON, Elimination
+from erl_torch.solvers import kernels
+from erl_torch.solvers.chains import EPSILON, Elimination
 from erl_torch.solvers.eigenpair import LOG_POWER_STEPS, POWER_STEPS
 from erl_torch.solvers.problem import Problem
 

@@ -2,7 +2,7 @@
 
     TV(s) = (1/beta) log sum_a prior(a|s) exp(beta (r(s,a) + E_{s'|s,a} V(s')))
 
-is its soft Bellman backup; ``erl_torch.mdp.certificates`` has what V and TV prove.
+is its soft Bellman backup; ``erl_torch.solvers.certificates`` has what V and TV prove.
 """
 
 from __future__ import annotations
@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from erl_torch import checks, kernels
-from erl_torch.mdp.certificates import Gains, gains
-from erl_torch.mdp.chains import Elimination, RegenerativeLU, SingularChainError, classes, reachable_from
+from erl_torch import checks
 from erl_torch.mdp.tabular import TabularMDP, check_prior
+from erl_torch.solvers import kernels
+from erl_torch.solvers.certificates import Gains, gains
+from erl_torch.solvers.chains import Elimination, RegenerativeLU, SingularChainError, classes, reachable_from
 
 
 @dataclass(frozen=True, eq=False)

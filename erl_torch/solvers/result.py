@@ -7,9 +7,9 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
-from erl_torch.mdp.certificates import objective, policy_gains, soft_backup
 from erl_torch.mdp.tabular import check_policy
 from erl_torch.solution import Solution, Status
+from erl_torch.solvers.certificates import objective, policy_gains, soft_backup
 from erl_torch.solvers.problem import Problem
 
 

@@ -22,10 +22,10 @@ from typing import Any
 import numpy as np
 
 from erl_torch import checks
-from erl_torch.mdp.certificates import soft_backup
-from erl_torch.mdp.chains import RegenerativeLU, SingularChainError
 from erl_torch.mdp.tabular import TabularMDP, check_policy
 from erl_torch.solution import Solution
+from erl_torch.solvers.certificates import soft_backup
+from erl_torch.solvers.chains import RegenerativeLU, SingularChainError
 from erl_torch.solvers.problem import Problem
 from erl_torch.solvers.result import Sized, ended, policy_gap, reducible_solution
 

@@ -37,9 +37,10 @@ from typing import ClassVar
 import numpy as np
 import torch
 
-from erl_torch import checks, kernels
+from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.experience.transitions import Parts, Recording, Transitions
+from erl_torch.learners.action_value import kernels
 from erl_torch.learners.learner import NonFiniteError, columns, epochs, run_to_end
 from erl_torch.mdp.tabular import check_prior
 from erl_torch.solution import Solution, Status

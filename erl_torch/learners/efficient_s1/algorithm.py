@@ -80,15 +80,17 @@ import scipy.sparse as sp
 import torch
 from scipy.special import logsumexp, softmax
 
-from erl_torch import checks, kernels
+from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.empirical.counts import EmpiricalMDP, EmpiricalProblem, empirical_mdp, tally
 from erl_torch.experience.transitions import Parts, Recording, Selection, Transitions
+from erl_torch.learners.efficient_s1 import kernels
 from erl_torch.learners.learner import NonFiniteError, columns, epochs, run_to_end
 from erl_torch.learners.s1.algorithm import BLOCK, LOG_PSI_EPSILON
-from erl_torch.mdp.certificates import gains, policy_gains, soft_backup
 from erl_torch.mdp.tabular import check_prior
 from erl_torch.solution import Solution, Status, proven
+from erl_torch.solvers import kernels as solvers_kernels
+from erl_torch.solvers.certificates import gains, policy_gains, soft_backup
 from erl_torch.solvers.problem import Problem
 
 LAST_STEP = 100_000  # visits of a pair in one biasing iteration after which its step stays
@@ -599,7 +601,7 @@ class EfficientS1:
         log_psi = state.log_psi.numpy()
         visited, (indptr, indices, values) = stream.visited, stream.psi_rows
         new_x, scratch, tilted = np.empty(len(visited)), np.empty(len(visited)), np.empty(len(values))
-        kernels.tilt_rows(indptr, indices, values, log_psi, new_x, scratch, tilted)
+        solvers_kernels.tilt_rows(indptr, indices, values, log_psi, new_x, scratch, tilted)
         new_y = np.add.reduceat(values * log_psi[indices], indptr[:-1])
         # One epoch of lines 2-3 is x <- keep x + (1 - keep) new: convex, whatever the numbers.
         with np.errstate(divide="ignore", under="ignore", over="ignore"):
@@ -882,7 +884,7 @@ SWITCHES = (
 def certificate(part: EmpiricalProblem, log_psi: np.ndarray, policy: np.ndarray) -> tuple[float, float]:
     """(min(T_pi V - V), max(TV - V)) on the empirical problem, V = -log(psi)/beta: J(pi) and g* there lie between.
 
-    Bounds with their rounding (``erl_torch.mdp.certificates``), for the problem as its numbers stand. What ``policy``
+    Bounds with their rounding (``erl_torch.solvers.certificates``), for the problem as its numbers stand. What ``policy``
     [S, A] does in pairs that take no part is left out, and the rest normalised.
     """
     problem = part.problem

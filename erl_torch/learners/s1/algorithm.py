@@ -70,12 +70,12 @@ from typing import ClassVar
 import numpy as np
 import torch
 
-from erl_torch import checks, kernels
+from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.empirical.counts import tally
 from erl_torch.experience.transitions import Parts, Recording, Transitions, tuple_at
 from erl_torch.learners.learner import NonFiniteError, columns, epochs, run_to_end
-from erl_torch.learners.s1 import listing
+from erl_torch.learners.s1 import kernels, listing
 from erl_torch.mdp.tabular import check_prior
 from erl_torch.solution import Solution, Status
 

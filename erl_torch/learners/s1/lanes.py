@@ -16,13 +16,15 @@ from typing import Any
 import numpy as np
 import torch
 
-from erl_torch import checks, kernels
+from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.experience.sampling import Sampler
+from erl_torch.experience.simulation import TUPLE_BYTES, Experience, Simulation, fits, tuples_of
 from erl_torch.experience.transitions import Transitions
 from erl_torch.learners.learner import NonFiniteError
-from erl_torch.learners.replicas import TUPLE_BYTES, Experience, Replicas, Simulation, fits, tuples_of
+from erl_torch.learners.replicas import Replicas
 from erl_torch.learners.s1 import device as s1_torch
+from erl_torch.learners.s1 import kernels
 from erl_torch.learners.s1.algorithm import AlgorithmS1, S1State, S1Stream, gains, line_12, positive, reward_biases
 from erl_torch.rng import streams
 

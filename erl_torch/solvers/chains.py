@@ -21,7 +21,7 @@ import scipy.sparse as sp
 import scipy.sparse.csgraph as csgraph
 import scipy.sparse.linalg as spla
 
-from erl_torch import kernels
+from erl_torch.solvers import kernels
 
 GTH_STATES = 100  # up to here the dense elimination is the faster
 DENSE_STATES = 2000  # up to here it is done where nothing else will do: seconds, 32 MB

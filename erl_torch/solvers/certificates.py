@@ -9,7 +9,7 @@ whatever the chain; of the second the states suffice that pi comes back to for e
 regularised reward of pi_V with the difference V(s') - V(s) added, which averages to nothing under a stationary
 distribution; and of all policies pi_V has the largest such reward in every state.
 
-The compiled rows (``kernels.gain_rows``, ``kernels.policy_gain_rows``) return each gain with a lower and an upper end
+The compiled rows (``certificate_kernels.gain_rows``, ``certificate_kernels.policy_gain_rows``) return each gain with a lower and an upper end
 that rounding cannot leave: E V - V(s) is a sum of p (V(s') - V(s)) over s' other than s, so that no digit is lost where
 a state is rarely left, and the error of an action counts as far as it is chosen (docs/theory.md, 6: every operation).
 The rows of transition, prior and policy are meant as divided by their sums, which are 1 but for rounding.
@@ -22,8 +22,8 @@ from typing import NamedTuple
 import numpy as np
 import scipy.sparse as sp
 
-from erl_torch import kernels
-from erl_torch.mdp.chains import (
+from erl_torch.solvers import certificate_kernels
+from erl_torch.solvers.chains import (
     EPSILON,
     GTH_STATES,
     RegenerativeLU,
@@ -58,7 +58,7 @@ def gains(transition: sp.csr_array, reward: np.ndarray, prior: np.ndarray, beta:
     gain, low, high = np.empty(n_states), np.empty(n_states), np.empty(n_states)
     policy = np.empty(reward.shape)
     p = transition
-    kernels.gain_rows(p.indptr, p.indices, p.data, reward, prior, beta, value, gain, low, high, policy)
+    certificate_kernels.gain_rows(p.indptr, p.indices, p.data, reward, prior, beta, value, gain, low, high, policy)
     return Gains(gain, low, high, policy)
 
 
@@ -73,14 +73,14 @@ def policy_gains(
     """(low, high) [S] of T_pi V - V, as ``gains``, for any policy [S, A]; -infinite where it leaves the prior."""
     low, high = np.empty(len(value)), np.empty(len(value))
     p = transition
-    kernels.policy_gain_rows(p.indptr, p.indices, p.data, reward, prior, beta, policy, value, low, high)
+    certificate_kernels.policy_gain_rows(p.indptr, p.indices, p.data, reward, prior, beta, policy, value, low, high)
     return low, high
 
 
 def soft_backup(q: np.ndarray, prior: np.ndarray, beta: float) -> tuple[np.ndarray, np.ndarray]:
     """((1/beta) log sum_a prior exp(beta q) [S], its policy [S, A]); accurate for any beta > 0 and any prior."""
     backed_up, policy = np.empty(len(q)), np.empty(q.shape)
-    kernels.soft_rows(np.ascontiguousarray(q), np.ascontiguousarray(prior), beta, backed_up, policy)
+    certificate_kernels.soft_rows(np.ascontiguousarray(q), np.ascontiguousarray(prior), beta, backed_up, policy)
     return backed_up, policy
 
 

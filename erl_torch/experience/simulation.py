@@ -1,0 +1,84 @@
+"""Experience of many replicas: one stream for all, one recorded stream each, or one simulated stream each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from erl_torch import checks
+from erl_torch.experience.collect import collect
+from erl_torch.experience.transitions import Transitions
+from erl_torch.mdp.tabular import TabularMDP, check_policy
+
+KEEP_BYTES = 1 << 30  # of tuples kept by default
+TUPLE_BYTES = 8  # a tuple in the interleaved loop
+
+
+@dataclass(frozen=True, eq=False)
+class Simulation:
+    """A stream of ``mdp`` for each seed: ``n_episodes`` of ``episode_length`` steps, a' from the learners' prior.
+
+    Args:
+        mdp: what is simulated; its sizes are those of the learners.
+        n_episodes, episode_length: whole numbers >= 1; their product is the length of each stream.
+        seeds: whole numbers >= 0, one a replica.
+        behaviour_policy: [S, A]; None is the prior.
+        keep: hold the tuples in memory (true), sample them again in every pass (false), or what fits 1 GiB (None).
+
+    Raises:
+        InputError: an argument out of its range.
+    """
+
+    mdp: TabularMDP
+    n_episodes: int
+    episode_length: int
+    seeds: Sequence[int]
+    behaviour_policy: Any = None
+    keep: bool | None = None
+
+    def __post_init__(self) -> None:
+        checks.plain(self)
+        checks.instance("mdp", self.mdp, TabularMDP, "a TabularMDP")
+        if self.keep is not None:
+            checks.flag("keep", self.keep)
+        checks.at_least("n_episodes", self.n_episodes, 1)
+        checks.at_least("episode_length", self.episode_length, 1)
+        if self.behaviour_policy is not None:
+            behaviour = check_policy("behaviour_policy", self.behaviour_policy, self.mdp.n_states, self.mdp.n_actions)
+            object.__setattr__(self, "behaviour_policy", behaviour)
+        for seed in checks.sequence("seeds", self.seeds):
+            checks.at_least("seeds", seed, 0)
+
+    @property
+    def n_tuples(self) -> int:
+        """Of each stream."""
+        return self.n_episodes * self.episode_length
+
+    def stream(self, replica: int, prior_policy: Any) -> Transitions:
+        """The tuples of one replica."""
+        seed = int(self.seeds[replica])
+        return collect(self.mdp, self.n_episodes, self.episode_length, seed, self.behaviour_policy, prior_policy)
+
+
+Experience = Transitions | Sequence[Transitions] | Simulation
+
+
+def tuples_of(experience: Experience, r: int, prior: np.ndarray) -> Transitions:
+    """The stream of one replica."""
+    if isinstance(experience, Transitions):
+        return experience
+    return experience.stream(r, prior) if isinstance(experience, Simulation) else experience[r]
+
+
+def fits(experience: Experience, n_replicas: int, tuple_bytes: int) -> bool:
+    """Whether the tuples of all replicas are to be kept, at so many bytes each."""
+    if isinstance(experience, Simulation):
+        n_tuples = experience.n_tuples
+        if experience.keep is not None:
+            return bool(experience.keep)
+    else:
+        n_tuples = max(len(data) for data in ([experience] if isinstance(experience, Transitions) else experience))
+    return n_tuples * n_replicas * tuple_bytes <= KEEP_BYTES

@@ -1,0 +1,72 @@
+"""What a policy is worth in a known MDP: its chain, its long run, reward rate and regularised objective.
+
+``objective`` is J(pi) = reward rate - KL rate / beta, with KL(pi(.|s) || prior(.|s)) averaged over the
+states that the policy visits; its maximum over policies is -theta*.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.sparse as sp
+
+from erl_torch.mdp.tabular import TabularMDP
+from erl_torch.solvers import certificates, chains, kernels
+from erl_torch.solvers.chains import long_run
+
+
+class PolicyChain(NamedTuple):
+    """The Markov chain that a policy makes of an MDP."""
+
+    transition: sp.csr_array  # [S, S]
+    reward: np.ndarray  # [S]
+
+
+def policy_chain(mdp: TabularMDP, policy: np.ndarray) -> PolicyChain:
+    """The chain of ``policy`` [S, A]."""
+    return PolicyChain(chains.policy_chain(mdp.transition, policy), (policy * mdp.reward).sum(1))
+
+
+def kl_per_state(policy: np.ndarray, prior: np.ndarray) -> np.ndarray:
+    """KL(policy(.|s) || prior(.|s)) in nats, [S]; infinite where the policy leaves the prior's support."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        terms = np.where(policy > 0, policy * np.log(policy / prior), 0.0)
+    return terms.sum(1)  # type: ignore[no-any-return]
+
+
+def reward_per_step(mdp: TabularMDP, policy: np.ndarray, horizon: int) -> float:
+    """Expected undiscounted return of ``horizon`` steps from the start distribution, divided by ``horizon``."""
+    chain = policy_chain(mdp, policy)
+    p = chain.transition
+    total = kernels.finite_horizon_return(p.indptr, p.indices, p.data, chain.reward, mdp.start, horizon)
+    return float(total) / horizon
+
+
+def stationary_distribution(transition: sp.csr_array, start: np.ndarray) -> np.ndarray:
+    """Long-run share of time in each state, from ``start`` [S]; chain as CSR [S, S].
+
+    Periodic chains and chains with several closed classes are fine: each class counts by the probability
+    of ending in it. No digit is lost where the chain rarely moves between its parts (``erl_torch.solvers.chains``).
+    """
+    return long_run(transition, start).of_state
+
+
+def induced_distribution(mdp: TabularMDP, policy: np.ndarray, horizon: int | None = None) -> np.ndarray:
+    """Share of time in each state [S] under ``policy``: in the long run, or over ``horizon`` steps from the start."""
+    chain = policy_chain(mdp, policy).transition
+    if horizon is None:
+        return stationary_distribution(chain, mdp.start)
+    share, now, backward = np.zeros(mdp.n_states), mdp.start, sp.csr_array(chain.T)
+    for _ in range(horizon):
+        share, now = share + now, backward @ now
+    return share / horizon
+
+
+def objective(mdp: TabularMDP, policy: np.ndarray, prior: np.ndarray, beta: float) -> float:
+    """J(pi): stationary reward rate minus KL/beta, from the start distribution; reward a step.
+
+    Exact but for rounding, unless products of probabilities underflow: then it is somewhere between the bounds that
+    ``certificates.objective`` has beside the same figure.
+    """
+    return certificates.objective(mdp.transition, mdp.reward, prior, beta, policy, mdp.start).value
