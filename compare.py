@@ -12,17 +12,17 @@ from typing import Any
 import hydra
 from omegaconf import DictConfig
 
+from erl_torch.cli import config
 from erl_torch.cli import main as cli
-from erl_torch.run import settings as schemas
 
-schemas.register()
+config.register()
 
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="compare")
 @cli.job
 def main(cfg: DictConfig, directory: Path, safe_point: Callable[[], None]) -> Any:
     # Imported here: torch takes seconds, and --help and Tab completion do not need it.
-    from erl_torch.run.comparing import run_comparison
+    from erl_torch.run.compare import run_comparison
 
     return run_comparison(cfg, directory, safe_point)
 

@@ -15,10 +15,10 @@ from typing import Any
 import hydra
 from omegaconf import DictConfig
 
+from erl_torch.cli import config
 from erl_torch.cli import main as cli
-from erl_torch.run import settings as schemas
 
-schemas.register()
+config.register()
 
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="train")

@@ -33,13 +33,12 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from erl_torch import InputError, NonFiniteError, pictures
+from erl_torch.cli import config, sweeps
 from erl_torch.cli import main as cli
-from erl_torch.cli import sweeps
 from erl_torch.files import write_json
 from erl_torch.reproduction.runner import reproduce
-from erl_torch.run import settings as schemas
 from erl_torch.run.checkpoint import Checkpoints
-from erl_torch.run.comparing import run_comparison
+from erl_torch.run.compare import run_comparison
 from erl_torch.run.playing import play
 from erl_torch.run.training import train
 
@@ -95,7 +94,7 @@ def keys(learner: str, env: str) -> dict[str, list[str]]:
 
 
 def configurations(n: int = 10_000, seed: int = 0) -> None:
-    schemas.register()
+    config.register()
     rng = np.random.default_rng(seed)
     learners = sorted(path.stem for path in (ROOT / "conf" / "learner").glob("*.yaml"))
     ends: collections.Counter[str] = collections.Counter()
@@ -173,7 +172,7 @@ def attempt(overrides: list[str], directory: Path, program: str = "train") -> st
 
 
 def checkpoints(n: int = 1000, seed: int = 0) -> None:
-    schemas.register()
+    config.register()
     rng = np.random.default_rng(seed)
     ends: collections.Counter[str] = collections.Counter()
 
@@ -240,7 +239,7 @@ PATIENCE = 4.0  # seconds; what still runs then has begun to work
 
 
 def extremes() -> None:
-    schemas.register()
+    config.register()
     ends: collections.Counter[str] = collections.Counter()
     failures: list[str] = []
     with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"), tempfile.TemporaryDirectory() as folder:
@@ -319,7 +318,7 @@ def apart(program: str, overrides: list[str], directory: Path) -> str:
 
 
 def directories(n: int = 3000, seed: int = 0) -> None:
-    schemas.register()
+    config.register()
     rng = np.random.default_rng(seed)
     ends: collections.Counter[str] = collections.Counter()
     failures = []

@@ -19,8 +19,8 @@ from pathlib import Path
 import numpy as np
 from hydra import compose, initialize_config_dir
 
+from erl_torch.cli import config
 from erl_torch.learners import LEARNERS
-from erl_torch.run import settings as schemas
 from erl_torch.run.training import train
 
 ROOT = Path(__file__).parents[1]
@@ -32,7 +32,7 @@ OLDER = {
 
 
 def runs(folder: Path) -> None:
-    schemas.register()
+    config.register()
     with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
         for learner in LEARNERS:
             for env in ("windy_cliff", "windy_maze", "frozen_lake"):

@@ -21,7 +21,8 @@ from test_config import composed
 from erl_torch import NonFiniteError, solve_soft_bellman
 from erl_torch.envs.windy_cliff import WindyCliffEnv
 from erl_torch.log import tensorboard as board
-from erl_torch.run.training import train, where
+from erl_torch.run.report import where
+from erl_torch.run.training import train
 from erl_torch.solvers import certify
 
 PAGE = (Path(__file__).parents[1] / "docs" / "logging.md").read_text()

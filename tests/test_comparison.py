@@ -10,16 +10,16 @@ from hydra import compose, initialize_config_dir
 from matplotlib.image import imread
 
 from erl_torch import AlgorithmS1, InputError, TabularMDP, collect, pictures, solve_soft_bellman
+from erl_torch.cli import config
 from erl_torch.cli import main as cli
+from erl_torch.evaluation import measure, optimum
 from erl_torch.learners import LEARNERS, DifferentialSoftQ, SoftQ
-from erl_torch.run import settings as schemas
-from erl_torch.run.comparing import run_comparison
-from erl_torch.run.comparison import MEASURES, compare, interquartile_mean, iqm_interval, measure, optimum
+from erl_torch.run.compare import MEASURES, compare, interquartile_mean, iqm_interval, run_comparison
 from erl_torch.solvers.policy import objective
 
 SMALL = ("experience.n_episodes=4", "experience.episode_length=500", "seeds=2", "n_sizes=2")
 PAIR = "learners=[differential_soft_q,soft_q]"
-schemas.register()
+config.register()
 
 
 def composed(*overrides):
@@ -211,7 +211,7 @@ def test_experience_is_that_of_train(finished):
     from test_config import composed as composed_train
 
     from erl_torch.experience.collect import known_mdp
-    from erl_torch.run.training import make_env
+    from erl_torch.run.build import make_env
 
     mdp = known_mdp(make_env(composed_train().env))
     solution = DifferentialSoftQ().fit(collect(mdp, 4, 500, 1), 15, 4)

@@ -14,13 +14,15 @@ from omegaconf import OmegaConf
 
 from erl_torch import InputError, checks
 from erl_torch.checks import InputError as ChecksInputError
+from erl_torch.cli import config
 from erl_torch.cli import main as cli
 from erl_torch.learners import LEARNERS, AlgorithmS1, ListedS1
 from erl_torch.run import settings as schemas
-from erl_torch.run.training import make_learner, train
+from erl_torch.run.build import make_learner
+from erl_torch.run.training import train
 
 CONF = Path(__file__).parents[1] / "conf"
-schemas.register()
+config.register()
 
 
 def composed(*overrides):
@@ -263,12 +265,12 @@ def test_other_complaints(tmp_path, overrides, expected):
 
 
 def test_run_names():
-    assert schemas.run_name(3, "learner.beta=2,seed=0") == "003-beta=2-seed=0"
-    assert schemas.run_name(0, "") == "000-run"
-    assert schemas.run_name(12, "+env.kwargs.desc=[a/b c],learner=s1") == "012-desc=-a-b-c-learner=s1"
-    assert len(schemas.run_name(1, "x=" + "y" * 500)) == 80
-    assert "/" not in schemas.slug("../../a b/c")
-    assert schemas.slug("") == "run"
+    assert config.run_name(3, "learner.beta=2,seed=0") == "003-beta=2-seed=0"
+    assert config.run_name(0, "") == "000-run"
+    assert config.run_name(12, "+env.kwargs.desc=[a/b c],learner=s1") == "012-desc=-a-b-c-learner=s1"
+    assert len(config.run_name(1, "x=" + "y" * 500)) == 80
+    assert "/" not in config.slug("../../a b/c")
+    assert config.slug("") == "run"
 
 
 def test_input_errors_are_value_errors_on_one_line():

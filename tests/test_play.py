@@ -18,8 +18,9 @@ from test_config import CONF, composed
 from erl_torch import InputError, Solution, TabularMDP
 from erl_torch.cli import main as cli
 from erl_torch.learners.replicas import ReplicaSolution
+from erl_torch.run.build import make_env
 from erl_torch.run.playing import find_run, play
-from erl_torch.run.training import make_env, train
+from erl_torch.run.training import train
 from erl_torch.solvers.policy import reward_per_step
 
 ROOT = Path(__file__).parents[1]

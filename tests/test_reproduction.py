@@ -14,6 +14,7 @@ from conftest import random_mdp
 from hydra import compose, initialize_config_dir
 
 from erl_torch import InputError, estimate_mdp, iterate_biasing
+from erl_torch.cli import config
 from erl_torch.reproduction import ARTIFACTS, SCALES, control, load, runner
 from erl_torch.reproduction.artifact import (
     AGREES,
@@ -33,10 +34,9 @@ from erl_torch.reproduction.artifact import (
     compared_samples,
 )
 from erl_torch.reproduction.figure_3 import moving_average, normalised
-from erl_torch.run import settings as schemas
 
 ROOT = Path(__file__).parents[1]
-schemas.register()
+config.register()
 
 
 @pytest.fixture(autouse=True)

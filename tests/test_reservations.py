@@ -346,7 +346,7 @@ def test_binned_cart_pole_is_no_success_unless_theta_is_right(tmp_path, capsys, 
 
 
 def test_why_the_data_say_nothing(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("erl_torch.run.training.SMALL", 14)
+    monkeypatch.setattr("erl_torch.run.judge.SMALL", 14)
     result = train(composed("experience.n_episodes=20", *SHORT), tmp_path)
     out = capsys.readouterr().out
     assert result["data"] == "nothing: the stream meets 15 states, and more than 14 are not solved beside a run"

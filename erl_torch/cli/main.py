@@ -28,9 +28,10 @@ from omegaconf.errors import OmegaConfBaseException, ValidationError
 
 from erl_torch.checks import InputError, out_of_memory
 from erl_torch.cli import sweeps
+from erl_torch.cli.config import register
 from erl_torch.files import alone, began_with, write_bytes
 from erl_torch.output import lasting
-from erl_torch.run.settings import SCHEMAS, allowed, register
+from erl_torch.run.settings import SCHEMAS, allowed
 
 # Here, for jobs in processes of their own: loading the task imports this module, and names directories next.
 register()

@@ -24,7 +24,6 @@ from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.envs import CONTROL_TASKS
 from erl_torch.envs.discretise import Discretise, UniformBins
-from erl_torch.experience.transitions import Transitions
 
 REWARDS = ("original", "cyclic")
 
@@ -176,15 +175,6 @@ class ControlEnv(gym.Env[np.int64, np.int64]):
         if self.reward == "cyclic":
             reward = (0.0 if terminated else reward) - self.task.max_reward
         return cell, reward, terminated, truncated, info
-
-    def collect(self, n_episodes: int, episode_length: int, **arguments: Any) -> Transitions:
-        """Episodes of this environment, all at once; arguments as in ``collect_rollouts``."""
-        from erl_torch.experience.rollouts import collect_rollouts
-
-        settings: dict[str, Any] = {"bins": self.bins, "reward": self.reward} | arguments
-        if self.task.max_action is not None:
-            settings["actions"] = self.actions
-        return collect_rollouts(self.task, n_episodes, episode_length, **settings)
 
     def render(self) -> Any:
         return self.env.render()

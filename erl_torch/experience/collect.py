@@ -27,7 +27,9 @@ from gymnasium.vector import AutoresetMode
 
 from erl_torch import checks
 from erl_torch.checks import InputError
+from erl_torch.envs.control import ControlEnv
 from erl_torch.experience.recording import ColumnWriter, save_columns
+from erl_torch.experience.rollouts import episodes_of
 from erl_torch.experience.sampling import Sampler
 from erl_torch.experience.transitions import Transitions, join
 from erl_torch.mdp.from_gymnasium import changed_by, known_mdp, sizes
@@ -173,15 +175,14 @@ def record(
 
 
 def batched(env: gym.Env[Any, Any]) -> Callable[..., Transitions] | None:
-    """``collect`` of an environment that can play many episodes at once, if it is not wrapped in something else."""
-    play = getattr(env.unwrapped, "collect", None)
-    if play is None or changed_by(env) is not None:
+    """What plays many episodes of ``env`` at once, if something can and it is not wrapped in something else."""
+    base = env.unwrapped
+    if not isinstance(base, ControlEnv) or changed_by(env) is not None:
         return None
     longest = env.spec.max_episode_steps if env.spec else None
 
     def collect_at_once(n_episodes: int, episode_length: int, **arguments: Any) -> Transitions:
-        data: Transitions = play(n_episodes, min(episode_length, longest or episode_length), **arguments)
-        return data
+        return episodes_of(base, n_episodes, min(episode_length, longest or episode_length), **arguments)
 
     return collect_at_once
 

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from erl_torch import checks
-from erl_torch.envs.control import REWARDS, ControlTask, control_task
+from erl_torch.envs.control import REWARDS, ControlEnv, ControlTask, control_task
 from erl_torch.envs.discretise import UniformBins
 from erl_torch.experience.sampling import policy_cdf
 from erl_torch.experience.transitions import Transitions
@@ -175,3 +175,11 @@ class _Player:
 
 def _table(policy: np.ndarray) -> np.ndarray:
     return policy_cdf(policy).reshape(policy.shape)
+
+
+def episodes_of(env: ControlEnv, n_episodes: int, episode_length: int, **arguments: Any) -> Transitions:
+    """Episodes of ``env``, all at once; arguments as in ``collect_rollouts``."""
+    settings: dict[str, Any] = {"bins": env.bins, "reward": env.reward} | arguments
+    if env.task.max_action is not None:
+        settings["actions"] = env.actions
+    return collect_rollouts(env.task, n_episodes, episode_length, **settings)

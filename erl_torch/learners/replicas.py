@@ -22,7 +22,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -36,6 +36,8 @@ from erl_torch.experience.transitions import Transitions
 from erl_torch.files import read_npz, write_npz
 from erl_torch.learners.learner import NonFiniteError, columns
 from erl_torch.learners.s1.algorithm import AlgorithmS1
+from erl_torch.learners.s1.lanes import can_interleave, interleave
+from erl_torch.learners.together import Together, check_learner
 from erl_torch.mdp.tabular import check_policy
 from erl_torch.solution import Solution
 
@@ -112,7 +114,7 @@ class ReplicaSolution:
 
 
 @dataclass(frozen=True, eq=False)
-class Replicas:
+class Replicas(Together):
     """Learners of one kind that run together; see the module's docstring.
 
     Args:
@@ -126,26 +128,8 @@ class Replicas:
         InputError: an argument out of its range.
     """
 
-    learners: tuple[Any, ...]
-    threads: int | None = None
-    block: int | None = None
-    layout: str = "auto"
-    backend: str = "auto"
-
     def __post_init__(self) -> None:
-        checks.plain(self)
-        object.__setattr__(self, "learners", checks.sequence("learners", self.learners))
-        checks.at_least("n_replicas", len(self.learners), 1)
-        for learner in self.learners:
-            _check_learner("learners", learner)
-            if type(learner) is not type(self.learners[0]):
-                raise InputError("learners", type(learner).__name__, f"all {type(self.learners[0]).__name__}")
-        if self.threads is not None:
-            checks.workers("threads", self.threads)
-        if self.block is not None:
-            checks.at_least("block", self.block, 1)
-        checks.one_of("layout", self.layout, ("auto", "lanes", "tables"))
-        checks.one_of("backend", self.backend, ("auto", "compiled", "torch"))
+        super().__post_init__()
         if self.backend == "torch" and not isinstance(self.learners[0], AlgorithmS1):
             raise InputError("backend", "torch", "compiled or auto: only AlgorithmS1 has torch operations")
 
@@ -162,7 +146,7 @@ class Replicas:
         **vectors: Iterable[float],
     ) -> Replicas:
         """``learner`` times ``n_replicas``; ``vectors`` give some of its arguments a value a replica, [R]."""
-        _check_learner("learner", learner)
+        check_learner("learner", learner)
         n_replicas = None if n_replicas is None else checks.at_least("n_replicas", n_replicas, 1)
         names = {f.name for f in fields(learner)}
         columns = {name: checks.sequence(name, values) for name, values in vectors.items()}
@@ -176,13 +160,6 @@ class Replicas:
             raise InputError("n_replicas", None, "given, or a vector of values")
         own = [{name: _number(column[r]) for name, column in columns.items()} for r in range(n_replicas)]
         return cls(tuple(replace(learner, **values) for values in own), threads, block, layout, backend)
-
-    def __len__(self) -> int:
-        return len(self.learners)
-
-    @property
-    def workers(self) -> int:
-        return self.threads or os.cpu_count() or 1
 
     def fit(self, experience: Experience, n_states: int, n_actions: int) -> ReplicaSolution:
         """Run all to the end. Raises InputError: what the learners raise, or streams that are not one a replica."""
@@ -198,8 +175,6 @@ class Replicas:
     ) -> Iterator[ReplicaState]:
         """Yield the state of all replicas after each epoch, from ``state`` on, until the last is done or has failed."""
         self._check(experience, n_states, n_actions)
-        from erl_torch.learners.s1.lanes import can_interleave, interleave
-
         run = interleave if can_interleave(self, experience) else each
         return run(self, experience, n_states, n_actions, state)
 
@@ -215,10 +190,6 @@ class Replicas:
                 rows.append({name: values[r].item() for name, values in row.items()})
             solutions.append(learner.solution(own, rows, state.failures.get(r)))
         return ReplicaSolution(tuple(solutions), state.failures)
-
-    def prior_policy(self, n_states: int, n_actions: int) -> np.ndarray:
-        """[S, A], the one of all replicas."""
-        return check_policy("prior_policy", self.learners[0].prior_policy, n_states, n_actions)
 
     def _check(self, experience: Experience, n_states: int, n_actions: int) -> None:
         prior = self.prior_policy(n_states, n_actions)
@@ -238,11 +209,6 @@ class Replicas:
         if isinstance(experience, Simulation) and experience.mdp.reward.shape != (n_states, n_actions):
             shape = experience.mdp.reward.shape
             raise InputError("experience", f"an MDP of shape {shape}", f"of shape {(n_states, n_actions)}")
-
-
-def _check_learner(key: str, learner: Any) -> None:
-    if not is_dataclass(learner) or isinstance(learner, type) or not hasattr(learner, "fit"):
-        raise InputError(key, f"{learner} ({type(learner).__name__})", "a learner that has fit, as AlgorithmS1()")
 
 
 def _number(value: Any) -> Any:

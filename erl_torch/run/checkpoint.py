@@ -252,3 +252,32 @@ def _json(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [_json(item) for item in value]
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value
+
+
+class Ended:
+    """Around the end of a run: what goes wrong once there is something to save is kept in ``error`` until it is saved.
+
+    Args:
+        learnt: whether there is.
+    """
+
+    def __init__(self, learnt: Callable[[], bool]) -> None:
+        self.learnt = learnt
+        self.error: Exception | None = None
+
+    def __enter__(self) -> Ended:
+        return self
+
+    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> bool:
+        if not isinstance(error, Exception) or not self.learnt():
+            return False
+        self.error = error
+        return True
+
+    @staticmethod
+    def keep(saved: Checkpoints, step: int, content: Callable[[], dict[str, Any]]) -> None:
+        """A checkpoint now; where even that fails, the rest can still be saved."""
+        try:
+            saved.offer(step, content, now=True)
+        except Exception as error:
+            print(f"warning: no checkpoint of tuple {step:,} ({type(error).__name__}: {error})", file=sys.stderr)

@@ -19,8 +19,8 @@ from erl_torch.learners.replicas import ReplicaSolution
 from erl_torch.mdp.from_gymnasium import sizes
 from erl_torch.mdp.tabular import check_policy
 from erl_torch.rng import streams
+from erl_torch.run.build import make_env
 from erl_torch.run.settings import Play, check_keys
-from erl_torch.run.training import make_env
 from erl_torch.solution import Solution
 
 RUNS = Path("runs")

@@ -45,26 +45,19 @@ from erl_torch.mdp.from_gymnasium import known_mdp, sizes
 from erl_torch.mdp.tabular import TabularMDP, check_policy
 from erl_torch.notes import collected, note
 from erl_torch.rng import streams
-from erl_torch.run.checkpoint import Checkpoints, rows_of
-from erl_torch.run.training import (
-    SMALL,
-    Ended,
+from erl_torch.run.build import (
     SafePoint,
     World,
     check_sizes,
-    ended_as,
     episode_model,
-    learning_bar,
     make_env,
     make_learner,
     make_world,
-    note_rows,
-    of_data,
-    plural,
     recorded,
-    versions,
-    where,
 )
+from erl_torch.run.checkpoint import Checkpoints, Ended, rows_of
+from erl_torch.run.judge import SMALL, of_data
+from erl_torch.run.report import ended_as, learning_bar, note_rows, plural, versions, where
 from erl_torch.solution import Status
 from erl_torch.solvers import solve_soft_bellman
 

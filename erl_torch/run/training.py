@@ -7,14 +7,12 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import platform
 import sys
 import time
-import warnings
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import fields, replace
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -22,42 +20,51 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
-import erl_torch
 from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.empirical import reservations
-from erl_torch.empirical.counts import EmpiricalMDP
 from erl_torch.empirical.reservations import Reservation
-from erl_torch.empirical.uncertainty import Estimate, theta_uncertainty
-from erl_torch.envs import grid_pictures
-from erl_torch.envs.discretise import Discretise
-from erl_torch.envs.estimate import estimate_mdp
-from erl_torch.envs.grid_world import GridWorld
+from erl_torch.empirical.uncertainty import Estimate
 from erl_torch.evaluation import Evaluation, evaluate
-from erl_torch.experience.collect import collect, record
-from erl_torch.experience.recording import FileRecording, check_target, open_recording
 from erl_torch.experience.transitions import Recording
-from erl_torch.files import read_npy, write_json
-from erl_torch.learners import LEARNERS, Exact, ExactState, NonFiniteError, S1State
+from erl_torch.files import write_json
+from erl_torch.learners import Exact, ExactState, NonFiniteError, S1State
 from erl_torch.learners.learner import columns
 from erl_torch.learners.s1 import kernels
 from erl_torch.log.tensorboard import Board, hyperparameters, layout
-from erl_torch.mdp.from_gymnasium import MeanRewardWarning, absorbing, known_mdp, sizes, tabular_mdp
+from erl_torch.mdp.from_gymnasium import sizes
 from erl_torch.mdp.tabular import TabularMDP, check_policy
 from erl_torch.notes import collected, note
 from erl_torch.rng import Streams, streams
-from erl_torch.run.checkpoint import Checkpoints, rows_of
+from erl_torch.run.build import (
+    SafePoint,
+    World,
+    check_evaluation,
+    collected_experience,
+    episode_model,
+    make_env,
+    make_learner,
+    make_world,
+    recorded,
+)
+from erl_torch.run.checkpoint import Checkpoints, Ended, rows_of
+from erl_torch.run.judge import of_data
+from erl_torch.run.replicated import train_replicas
+from erl_torch.run.report import (
+    Drawer,
+    Stopwatch,
+    data_tags,
+    evaluation_tags,
+    learning_bar,
+    mean_return,
+    optimal_tags,
+    result_of,
+    say,
+    summary,
+)
 from erl_torch.run.settings import check_keys
-from erl_torch.solution import Solution, Status, proven
+from erl_torch.solution import Solution, proven
 from erl_torch.solvers import certify, solve_soft_bellman
-from erl_torch.solvers.chains import SingularChainError
-from erl_torch.solvers.policy import reward_per_step
-
-SafePoint = Callable[[], None]
-TABLES = 8  # of a learner's size, about, while it learns and is evaluated
-REPLICA_BYTES = 10_000  # of a replica, besides: generators and settings
-SMALL = 2000  # states of a model, or that a stream meets, up to which it is solved beside every run
-NOT_ARGUMENTS = ("name", "id", "suggest", "stream", "n_samples", "model_seed")
 
 
 def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lambda: None) -> dict[str, Any]:
@@ -84,7 +91,7 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
     torch.set_num_threads(1 if many else cfg.threads or 1)
     if not kernels.compiled_before():
         print("compiling the loops, about ten seconds: on the first run only", file=sys.stderr)
-    _check_evaluation(cfg.evaluation)
+    check_evaluation(cfg.evaluation)
     settings: Any = OmegaConf.to_container(cfg, resolve=True)
     saved = Checkpoints(directory, settings, cfg.checkpoint_every, "cpu" if many else cfg.learner.get("device", "cpu"))
     if (result := saved.result()) is not None:
@@ -92,8 +99,6 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
         saved.clear()
         return result
     if many:
-        from erl_torch.run.replicated import train_replicas
-
         return train_replicas(cfg, directory, safe_point, saved)
     for key in ("shared_stream", "keep_tuples"):
         if cfg[key]:
@@ -120,7 +125,7 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
         start = state = learner.init(n_states, n_actions)
         history: list[dict[str, float]] = []
         stopped: BaseException | None = None
-        clock = _Stopwatch()
+        clock = Stopwatch()
         best = run.optimum(judge, prior) if e.certify else None
         estimate = run.uncertainty(prior) if e.certify else None
         episode = episode_model(env, world)
@@ -134,7 +139,7 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
             clock.seconds, began = found["learning"], began - found["seconds"]
         else:
             first = last = measure(state.policy)
-        lines = evaluation_tags(first, "prior") | _optimal_tags(best, judge, episode, horizon) | _data_tags(estimate)
+        lines = evaluation_tags(first, "prior") | optimal_tags(best, judge, episode, horizon) | data_tags(estimate)
         boards = layout([*run.names(start), *evaluation_tags(first)], lines)
         settings = hyperparameters(cfg, n_experience=run.n_experience)
         mark = found["events"] if found else None
@@ -142,7 +147,7 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
         ended = Ended(lambda: solution is not None)
         with ended, saved.refusing(lambda: bool(history)), Board(directory, settings, boards, mark) as board:
             board.lines(lines)
-            drawer = _Drawer(board, getattr(env.unwrapped, "grid", None)) if cfg.evaluation.pictures else None
+            drawer = Drawer(board, getattr(env.unwrapped, "grid", None)) if cfg.evaluation.pictures else None
             if not found:
                 board.texts(cfg)
                 board.record(run.tags(state, first), 0)
@@ -186,7 +191,7 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
                         bar.set_postfix_str(run.postfix(state), refresh=False)
                         bar.update(step - bar.n)
                         if milestone:
-                            _say(milestone, state, last)
+                            say(milestone, state, last)
                         reached = complete()
                         if run.digest is not None:
                             saved.offer(step, snapshot)
@@ -207,7 +212,7 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
                 solution = certify(solution, judge, learner.beta, prior, best)
             else:
                 for step in (0, run.step(state)):
-                    board.scalars(_optimal_tags(solution, judge, episode, horizon), step)
+                    board.scalars(optimal_tags(solution, judge, episode, horizon), step)
             exact = (last.objective, first.objective) if judge is not None else (np.nan, np.nan)
             ended_so = reservations.of_outcome(solution.status, solution.message, *exact)
             for _, text in ended_so + run.outcome(solution.theta, estimate):
@@ -224,7 +229,7 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
     assert solution is not None
     solution.save(directory / "solution.npz")
     seconds = time.perf_counter() - began
-    result = _result(cfg, solution, last, run.n_experience, clock.seconds, seconds)
+    result = result_of(cfg, solution, last, run.n_experience, clock.seconds, seconds)
     if estimate is not None:
         result["data"] = f"nothing: {estimate.withheld}" if np.isnan(estimate.value) else str(estimate)
     else:
@@ -236,48 +241,11 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
     result["n_skipped"] = run.n_skipped
     result["notes"] = notes
     write_json(directory / "result.json", result)
-    print(_summary(cfg, first, last, start, result, directory, run.unit, played=judge is None))
+    print(summary(cfg, first, last, start, result, directory, run.unit, played=judge is None))
     if stopped is not None:
         raise stopped
     saved.clear()
     return result
-
-
-class Ended:
-    """Around the end of a run: what goes wrong once there is something to save is kept in ``error`` until it is saved.
-
-    Args:
-        learnt: whether there is.
-    """
-
-    def __init__(self, learnt: Callable[[], bool]) -> None:
-        self.learnt = learnt
-        self.error: Exception | None = None
-
-    def __enter__(self) -> Ended:
-        return self
-
-    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> bool:
-        if not isinstance(error, Exception) or not self.learnt():
-            return False
-        self.error = error
-        return True
-
-    @staticmethod
-    def keep(saved: Checkpoints, step: int, content: Callable[[], dict[str, Any]]) -> None:
-        """A checkpoint now; where even that fails, the rest can still be saved."""
-        try:
-            saved.offer(step, content, now=True)
-        except Exception as error:
-            print(f"warning: no checkpoint of tuple {step:,} ({type(error).__name__}: {error})", file=sys.stderr)
-
-
-class World(NamedTuple):
-    """What a run learns from and is judged by."""
-
-    source: TabularMDP | gym.Env[Any, Any]  # of the stream
-    mdp: TabularMDP | None  # the model to evaluate on, to certify with, and to solve
-    episode: TabularMDP | None = None  # the model of one episode: its end is absorbed, without reward
 
 
 class _Learning:
@@ -303,7 +271,7 @@ class _Learning:
             found = recorded(cfg.experience, env, *self.sizes, cfg.seed, prior, safe_point)
             self.data, self.n_skipped = found.held(), found.n_skipped
         else:
-            self.data = _experience(cfg.experience, world.source, *self.sizes, rng, prior, safe_point)
+            self.data = collected_experience(cfg.experience, world.source, *self.sizes, rng, prior, safe_point)
         self.n_experience = len(self.data)
         self.digest: int | None = self.data.checksum()
         safe_point()
@@ -392,22 +360,6 @@ class _Learning:
         return of_data(self.counted.model, self.learner.beta, prior)
 
 
-def of_data(model: EmpiricalMDP | None, beta: float, prior: np.ndarray) -> Estimate:
-    """theta* with its error, as a stream alone has it; withheld, with a value of NaN, where that cannot be had."""
-    if model is None:
-        reason = "the squares of the rewards overflow"
-    elif (met := int(model.visits.any(1).sum())) > SMALL:
-        reason = f"the stream meets {met:,} states, and more than {SMALL:,} are not solved beside a run"
-    else:
-        try:
-            return theta_uncertainty(model, beta, prior)
-        except InputError as error:  # streams that return nowhere
-            reason = str(error)
-        except (SingularChainError, np.linalg.LinAlgError):
-            reason = "the chain of the data falls apart in double precision"
-    return Estimate("theta", np.nan, np.inf, withheld=reason)
-
-
 class _Solving:
     """A run that solves the environment's model."""
 
@@ -477,412 +429,7 @@ class _Solving:
         """There are no data."""
 
 
-def learning_bar(total: int | None, unit: str) -> tqdm:
-    return tqdm(
-        total=total, desc="learning", unit=f" {unit}", unit_scale=True, disable=None,
-        bar_format="{l_bar}{bar:20}| {elapsed}<{remaining}, {rate_fmt}{postfix}" if total else None,
-    )  # fmt: skip
-
-
-def evaluation_tags(measured: Evaluation, prefix: str = "eval") -> dict[str, float]:
-    return {
-        f"{prefix}/return": measured.mean_return,
-        f"{prefix}/reward_per_step": measured.reward_per_step,
-        f"{prefix}/objective": measured.objective,
-    }
-
-
-def _optimal_tags(
-    best: Solution | None, judge: TabularMDP | None, episode: TabularMDP | None, horizon: int
-) -> dict[str, float]:
-    """What ``best`` proves of theta*, and where the proof is complete the figures of its policy."""
-    if best is None or best.theta is None or best.theta_bounds is None:
-        return {}
-    low, high = best.theta_bounds
-    found = {"theta": best.theta, "theta_lower": low, "theta_upper": high}
-    if best.status is Status.CONVERGED:
-        found |= {"objective": -best.theta, "delta_max": best.reward_bias_max}
-        found["delta_mean"] = float(best.reward_bias.mean())
-        if best.rho is not None and np.isfinite(best.rho):
-            found["rho"] = best.rho
-        if judge is not None:
-            policy = best.policy.numpy()
-            found["reward_per_step"] = reward_per_step(judge, policy, horizon)
-            if episode is not None:
-                found["return"] = mean_return(episode, horizon, policy)
-    return {f"optimal/{name}": value for name, value in found.items()}
-
-
-def _data_tags(estimate: Estimate | None) -> dict[str, float]:
-    if estimate is None or np.isnan(estimate.value):
-        return {}
-    if estimate.withheld:
-        return {"data/theta": estimate.value}
-    low, high = estimate.interval()
-    return {"data/theta": estimate.value, "data/theta_lower": low, "data/theta_upper": high}
-
-
-def _say(milestone: str, state: Any, measured: Evaluation) -> None:
-    if isinstance(state, ExactState):
-        # A biasing iteration's own theta is optimistic: below theta* until the last.
-        found = f"theta {state.theta:.10f}  {proven(state.theta_bounds, None)}  "
-    else:
-        found = f"rho {state.rho:.4e}  " if hasattr(state, "rho") else ""
-        found += "" if state.theta is None else f"theta {state.theta:.5f}  "
-    if hasattr(state, "reward_bias"):
-        found += f"delta max {float(state.reward_bias.max()):.4f}  "
-    tqdm.write(
-        f"{milestone}: {found}reward per step {measured.reward_per_step:.4f}  objective {measured.objective:.4f}",
-        file=sys.stderr,
-    )
-
-
-class _Stopwatch:
-    """Seconds spent inside an iterator, apart from what its caller does between the items."""
-
-    def __init__(self) -> None:
-        self.seconds = 0.0
-
-    def time(self, states: Iterator[Any]) -> Iterator[Any]:
-        while True:
-            tick = time.perf_counter()
-            try:
-                state = next(states)
-            except StopIteration:
-                return
-            finally:
-                self.seconds += time.perf_counter() - tick
-            yield state
-
-
 # -- from configuration to objects ------------------------------------------------------------------
 
 
-@contextlib.contextmanager
-def _group(name: str) -> Iterator[None]:
-    """Complaints raised inside name their configuration group."""
-    try:
-        yield
-    except InputError as error:
-        raise error.within(name) from error
-
-
-def make_env(cfg: DictConfig, render_mode: str | None = None) -> gym.Env[Any, Any]:
-    """The environment of ``cfg``. Raises InputError."""
-    keys: Any = OmegaConf.to_container(cfg, resolve=True)
-    arguments = keys["kwargs"] if "kwargs" in keys else {k: v for k, v in keys.items() if k not in NOT_ARGUMENTS}
-    with _group("env"):
-        if isinstance(arguments.get("wind"), str):
-            arguments["wind"] = read_npy(arguments["wind"], "wind")
-        if render_mode is not None:
-            arguments["render_mode"] = render_mode
-        try:
-            env = gym.make(cfg.id, **arguments)
-        except InputError:
-            raise
-        except (gym.error.Error, ImportError) as error:
-            raise InputError("id", cfg.id, f"an environment that Gymnasium has ({error})") from error
-        except Exception as error:  # whatever an environment answers arguments with
-            if checks.out_of_memory(error):
-                raise
-            said = f"{type(error).__name__}: {error}"
-            raise InputError("kwargs", arguments, f"arguments of {cfg.id} ({said})") from error
-        binning = {key: keys.get(key) for key in ("bins", "low", "high", "actions")}
-        if "kwargs" in keys and any(value is not None for value in binning.values()):
-            return Discretise(env, **binning)
-        return env
-
-
-def make_world(cfg: DictConfig, env: gym.Env[Any, Any], safe_point: SafePoint) -> World:
-    """What there is to learn from in ``env``, as ``cfg`` says. Raises InputError."""
-    if "n_samples" in cfg:
-        return _control_world(cfg, env, safe_point)
-    on_end = cfg.get("on_end", "restart")
-    checks.one_of("env.on_end", on_end, ("restart", "absorb"))
-    if known_mdp(env) is not None or not cfg.get("use_model") or not hasattr(env.unwrapped, "P"):
-        if on_end == "absorb":
-            raise InputError("env.on_end", on_end, "restart, where there is no model (P) to read")
-        return World(env, known_mdp(env))
-    models = {}
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", MeanRewardWarning)
-        for reading in ("restart", "absorb"):
-            try:
-                models[reading] = tabular_mdp(env, reading)
-            except InputError as error:
-                if reading == on_end == "absorb":
-                    raise error.within("env") from error
-                if reading == on_end:
-                    note(f"learning from env.step, for {error}")
-    for message in sorted({str(warning.message) for warning in caught}):
-        note(message)
-    episode = models.get("absorb")
-    if episode is not None and episode.reward[absorbing(episode)].any():
-        episode = None  # an end that pays for ever is no end
-    mdp = models.get(on_end)
-    return World(env if mdp is None else mdp, mdp, episode)
-
-
-def _control_world(cfg: DictConfig, env: gym.Env[Any, Any], safe_point: SafePoint) -> World:
-    with _group("env"):
-        checks.one_of("stream", cfg.stream, ("model", "episodes"))
-        if cfg.stream == "episodes":
-            return World(env, None)
-        base: Any = env.unwrapped
-        mdp = estimate_mdp(
-            base.task,
-            base.bins.bins,
-            base.bins.low,
-            base.bins.high,
-            actions=base.actions if base.task.max_action is not None else None,
-            n_samples=cfg.n_samples,
-            seed=cfg.model_seed,
-            report=lambda _: safe_point(),
-            progress=True,
-        ).mdp
-    # Episodes of the stream start in any cell, so that all are learnt about.
-    return World(TabularMDP(mdp.transition, mdp.reward), mdp)
-
-
-def episode_model(env: gym.Env[Any, Any], world: World) -> TabularMDP | None:
-    """The model whose rewards over the horizon are an episode's return; None where there is none."""
-    endless = known_mdp(env) is not None and not getattr(env.unwrapped, "ends", np.zeros(1)).any()
-    return world.episode or (world.mdp if endless else None)
-
-
-def mean_return(episode: TabularMDP, horizon: int, policy: np.ndarray) -> float:
-    """Expected return of an episode of at most ``horizon`` steps, which ``episode`` is the model of."""
-    return horizon * reward_per_step(episode, policy, horizon)
-
-
-def make_learner(cfg: DictConfig, n_states: int, n_actions: int, key: str = "learner") -> Any:
-    """The learner of ``cfg``; complaints name their keys under ``key``."""
-    learner_class = LEARNERS[cfg.name]
-    with _group(key):
-        arguments = {f.name: cfg[f.name] for f in fields(learner_class)}
-        if cfg.prior_policy is not None:
-            arguments["prior_policy"] = read_npy(cfg.prior_policy, "prior_policy")
-        learner = learner_class(**arguments)
-    check_sizes(n_states, n_actions)
-    with _group(key):
-        learner.init(n_states, n_actions)  # validates the prior against the sizes
-        return learner
-
-
-def check_sizes(n_states: int, n_actions: int, n_replicas: int = 1) -> None:
-    """Raise InputError unless pairs have numbers of 32 bits, and the tables of a learner find room."""
-    n_pairs = n_states * n_actions
-    if n_pairs >= 2**31:
-        raise InputError("n_states * n_actions", f"{n_states} * {n_actions}", "below 2**31")
-    needed = n_replicas * (8 * TABLES * n_pairs + REPLICA_BYTES)
-    what = f"{n_states:,} states and {n_actions:,} actions, in {TABLES} tables"
-    if n_replicas > 1:
-        checks.memory("n_replicas", n_replicas, needed, f"a learner each, of {what}")
-    else:
-        checks.memory("n_states * n_actions", f"{n_states} * {n_actions}", needed, what)
-
-
-def recorded(
-    cfg: DictConfig, env: Any, n_states: int, n_actions: int, seed: int, prior: np.ndarray, safe_point: SafePoint
-) -> FileRecording:
-    """The stream that ``cfg`` names. Raises InputError."""
-    with _group("experience"), _collecting("reading", None, safe_point) as report:
-        data = FileRecording(
-            cfg.path,
-            n_states,
-            n_actions,
-            on_bad=cfg.on_bad,
-            chunk=cfg.chunk,
-            env=env,
-            prior_policy=prior,
-            on_prior=cfg.on_prior,
-            seed=seed,
-            report=report,
-        )
-    if data.n_skipped:
-        total = data.n_skipped + len(data)
-        said = f"; the first is {data.first_skipped}" if data.first_skipped else ""
-        note(f"{cfg.path}: {data.n_skipped:,} bad tuples of {total:,} left out{said}")
-    return data
-
-
-@contextlib.contextmanager
-def _collecting(what: str, total: int | None, safe_point: SafePoint) -> Iterator[Callable[[int], None]]:
-    """A progress bar that is told how many tuples there are so far, and lets signals through."""
-    with tqdm(
-        total=total, desc=what, unit=" tuples", unit_scale=True, delay=1, leave=False, disable=None,
-    ) as bar:  # fmt: skip
-
-        def report(n: int) -> None:
-            bar.update(n - bar.n)
-            safe_point()
-
-        yield report
-
-
-def _experience(
-    cfg: DictConfig,
-    source: TabularMDP | gym.Env[Any, Any],
-    n_states: int,
-    n_actions: int,
-    rng: Streams,
-    prior: np.ndarray,
-    safe_point: Callable[[], None],
-) -> Recording:
-    with _group("experience"):
-        behaviour = None
-        if cfg.behaviour_policy is not None:
-            behaviour = read_npy(cfg.behaviour_policy, "behaviour_policy")
-        if cfg.save_to is not None:
-            check_target("save_to", cfg.save_to)
-        total = cfg.n_episodes * cfg.episode_length if cfg.n_episodes >= 1 and cfg.episode_length >= 1 else 0
-        with _collecting("collecting", total, safe_point) as report:
-            arguments = cfg.n_episodes, cfg.episode_length, rng, behaviour, prior, report
-            if cfg.save_to is not None and cfg.save_to.endswith("/"):
-                return open_recording(record(source, cfg.save_to, *arguments), n_states, n_actions)
-            data = collect(source, *arguments)
-        if cfg.save_to is not None:
-            check_target("save_to", cfg.save_to)  # again: the collecting may have taken hours
-            data.save(cfg.save_to)
-        return data
-
-
-def _check_evaluation(cfg: DictConfig) -> None:
-    with _group("evaluation"):
-        for key in ("every", "n_episodes", "horizon", "exact_up_to"):
-            checks.at_least(key, cfg[key], 1)
-        checks.memory("n_episodes", cfg.n_episodes, 8 * cfg.n_episodes, "the returns of all episodes")
-
-
 # -- what is shown ----------------------------------------------------------------------------------
-
-
-class _Drawer:
-    def __init__(self, board: Board, grid: GridWorld | None) -> None:
-        self.board, self.grid = board, grid
-
-    def policy(self, state: Any, step: int, title: str) -> None:
-        self.board.picture("policy", grid_pictures.policy_picture(state.policy.cpu().numpy(), self.grid, title), step)
-
-    def bias(self, state: Any, step: int, title: str) -> None:
-        self.board.picture(
-            "reward_bias", grid_pictures.bias_picture(state.reward_bias.cpu().numpy(), self.grid, title), step
-        )
-
-
-def _result(
-    cfg: DictConfig, solution: Solution, last: Evaluation, n_data: int, learning: float, seconds: float
-) -> dict[str, Any]:
-    return {
-        "env": cfg.env.name,
-        "learner": cfg.learner.name,
-        "beta": cfg.learner.beta,
-        "seed": cfg.seed,
-        "status": solution.status.name.lower(),
-        "message": solution.message,
-        "theta": solution.theta,
-        "rho": solution.rho if solution.rho and solution.rho < np.inf else None,  # beyond double precision: theta tells
-        "reward_bias_max": solution.reward_bias_max,
-        "reward_per_step": last.reward_per_step,
-        "objective": last.objective,
-        "return": last.mean_return,
-        "theta_bounds": list(solution.theta_bounds) if solution.theta_bounds else None,
-        "gap": solution.gap,
-        "k": solution.k,
-        "n_experience": n_data,
-        "n_tuples" if n_data else "n_iterations": solution.n_steps,
-        "seconds_learning": round(learning, 3),
-        "seconds": round(seconds, 3),
-        "versions": versions(),
-    }
-
-
-def versions() -> dict[str, str]:
-    """Of what a result depends on."""
-    return {
-        "erl_torch": erl_torch.__version__,
-        "python": platform.python_version(),
-        "torch": torch.__version__,
-        "numpy": np.__version__,
-        "gymnasium": gym.__version__,
-    }
-
-
-def where(directory: Path) -> tuple[Path, Path | str]:
-    """A run directory as a user would write it, and what to give TensorBoard."""
-    with contextlib.suppress(ValueError):
-        directory = directory.resolve().relative_to(Path.cwd())
-    if directory.parent.name.startswith("sweep-"):
-        return directory, directory.parent  # its runs side by side, by short names
-    return directory, "runs" if directory.parts[0] == "runs" else directory
-
-
-def _summary(
-    cfg: DictConfig,
-    first: Evaluation,
-    last: Evaluation,
-    start: Any,
-    result: dict[str, Any],
-    directory: Path,
-    unit: str,
-    played: bool,
-) -> str:
-    directory, logs = where(directory)
-    done = result[f"n_{unit}"]
-    is_s1 = isinstance(start, S1State)
-    of_play = "  (the prior's: an estimate, of the episodes played)" * played
-    rows = [
-        *(
-            [("theta", f"{-first.objective:12.5f}", f"{result['theta']:12.5f}{of_play}")]
-            if result["theta"] is not None
-            else []
-        ),
-        *([("rho", f"{'-':>12}", f"{result['rho']:12.4e}")] if is_s1 and result["rho"] is not None else []),
-        ("reward per step", f"{first.reward_per_step:12.5f}", f"{last.reward_per_step:12.5f}"),
-        ("objective", f"{first.objective:12.5f}", f"{last.objective:12.5f}"),
-        ("episode return", f"{first.mean_return:12.2f}", f"{last.mean_return:12.2f}"),
-    ]
-    lines = [
-        "",
-        f"{cfg.env.name}, {cfg.learner.name}, beta {cfg.learner.beta:g}, seed {cfg.seed}: {ended_as(result)}",
-        f"{'':18}{'prior':>12}{'learnt':>12}",
-        *(f"{name:18}{before}{after}" for name, before, after in rows),
-    ]
-    if result["theta_bounds"] is not None:
-        lines.append(f"{'proven':18}{proven(result['theta_bounds'], result['gap'])}")
-    if result["data"]:
-        fewest, away = result["data_smallest_visits"], result["data_half_widths"]
-        met = result["data_states"]
-        of = "" if met is None or met[0] == met[1] else f"{met[0]:,} of {met[1]:,} states met, "
-        each = f"{fewest} visit{'s' * (fewest != 1)} or more of each pair that counts"
-        rests = "" if fewest is None else f" (95%; {of}{each})"
-        rests += f"; learnt: {away:.2f} half widths from its middle" if away is not None and away > 1 else ""
-        lines.append(f"{'the data say':18}{result['data']}{rests}")
-    if result["n_experience"]:
-        rate = done / max(result["seconds_learning"], 1e-3) / 1e6
-        lines.append(f"{'tuples streamed':18}{done:,} (of {result['n_experience']:,}; {rate:.3g} M/s)")
-    else:
-        k = "" if result["k"] is None else f" (k = {result['k']})"
-        lines.append(f"{'iterations':18}{done}{k}")
-    lines += [
-        f"{'seconds':18}{result['seconds']:.1f}, of which {result['seconds_learning']:.1f} learning",
-        f"{'run directory':18}{directory}",
-        f"{'look at it':18}tensorboard --logdir {logs}",
-    ]
-    lines += note_rows(result)
-    return "\n".join(lines)
-
-
-def ended_as(result: Mapping[str, Any]) -> str:
-    """The status of ``result.json``, which is no success without its notes."""
-    n = len(result["notes"])
-    return f"{result['status']}, with {plural(n, 'note')}" if n else f"{result['status']}"
-
-
-def plural(n: int, thing: str) -> str:
-    return f"{n} {thing}" if n == 1 else f"{n} {thing}s"
-
-
-def note_rows(result: Mapping[str, Any]) -> list[str]:
-    """A row of the summary each."""
-    return [f"{'note':18}{text}" for text in result["notes"]]

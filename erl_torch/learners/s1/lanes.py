@@ -22,10 +22,10 @@ from erl_torch.experience.sampling import Sampler
 from erl_torch.experience.simulation import TUPLE_BYTES, Experience, Simulation, fits, tuples_of
 from erl_torch.experience.transitions import Transitions
 from erl_torch.learners.learner import NonFiniteError
-from erl_torch.learners.replicas import Replicas
 from erl_torch.learners.s1 import device as s1_torch
 from erl_torch.learners.s1 import kernels
 from erl_torch.learners.s1.algorithm import AlgorithmS1, S1State, S1Stream, gains, line_12, positive, reward_biases
+from erl_torch.learners.together import Together
 from erl_torch.rng import streams
 
 COMMON = (
@@ -47,7 +47,7 @@ ROWS = 256  # sampled at a time
 NOISY_ROWS = 8192  # of exp(beta r) at a time
 
 
-def can_interleave(replicas: Replicas, experience: Experience) -> bool:
+def can_interleave(replicas: Together, experience: Experience) -> bool:
     """Whether ``replicas`` are published Algorithm S1 with the same loop for all, on streams of one length."""
     learners = replicas.learners
     if not isinstance(learners[0], AlgorithmS1) or learners[0].implementation != "fast":
@@ -122,7 +122,7 @@ class LanesState:
 
 
 def interleave(
-    replicas: Replicas, experience: Experience, n_states: int, n_actions: int, state: LanesState | None = None
+    replicas: Together, experience: Experience, n_states: int, n_actions: int, state: LanesState | None = None
 ) -> Iterator[LanesState]:
     """``Replicas.iterate`` of published Algorithm S1."""
     engine = Engine(replicas, experience, n_states, n_actions)
@@ -149,7 +149,7 @@ class Lanes:
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Replicas that are interleaved, and how their tuples come."""
+    """Together that are interleaved, and how their tuples come."""
 
     part: slice
     run: Callable[..., None]  # (begin, end, g, z, q, rates, failed) over tuples of the lanes, tables in place
@@ -160,7 +160,7 @@ class Block:
 class Engine:
     """S1's replicas on one experience: ``init``, ``prepare``, ``step``, as of a single learner."""
 
-    replicas: Replicas
+    replicas: Together
     experience: Experience
     n_states: int
     n_actions: int
