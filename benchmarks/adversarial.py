@@ -35,7 +35,7 @@ from many_digits import KINDS, Given, NoRateError, Oracle, Rate, policies, probl
 from mpmath import mp, mpf  # noqa: E402
 
 from erl_torch import InputError, TabularMDP, certify, evaluation, solve_biasing, solve_soft_bellman  # noqa: E402
-from erl_torch.solvers import policy as exact_policy
+from erl_torch.solvers import policy as exact_policy  # noqa: E402
 
 try:
     from erl_torch.solvers import certificates

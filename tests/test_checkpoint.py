@@ -276,7 +276,7 @@ def test_any_error_keeps_what_was_learnt(tmp_path, monkeypatch, error, place, re
     module = "replicated" if replicas else "training"
     target, name = {
         "learner": (AlgorithmS1, "step") if not replicas else (Replicas, "iterate"),
-        "evaluation": (f"erl_torch.{module}._Judges", "__call__")
+        "evaluation": (f"erl_torch.run.{module}._Judges", "__call__")
         if replicas
         else ("erl_torch.run.training", "evaluate"),
         "log": ("erl_torch.log.tensorboard.Board", "scalars"),

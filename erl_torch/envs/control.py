@@ -2,8 +2,8 @@
 
 A ``ControlTask`` holds the dynamics of one of Gymnasium's environments as pure functions over tensors, so that many
 states step at once on any device. ``ControlEnv`` is the same task with Discrete spaces over Gymnasium's own
-environment. ``erl_torch.envs.estimate`` turns a task into a TabularMDP, ``erl_torch.experience.rollouts`` plays episodes in
-the original dynamics.
+environment. ``erl_torch.envs.estimate`` turns a task into a TabularMDP, ``erl_torch.experience.rollouts`` plays
+episodes in the original dynamics.
 
 A state tensor is [N, d]; columns are best contiguous (``torch.stack(columns).T``). All is float64.
 """

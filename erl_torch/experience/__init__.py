@@ -1,1 +1,1 @@
-""""""
+"""Tuples (s, a, r, s', a'): collected, simulated, recorded, read."""

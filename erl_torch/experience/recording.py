@@ -15,10 +15,10 @@ and ends the reading; with ``on_bad="skip"`` it is left out and counted, as are 
 directory or npz is too short. A damaged npz, Parquet or Minari file ends the reading with either: none of its rows can
 be trusted. (Damage shows by the file's own checksums, which Parquet has only where its writer was asked for them.)
 
-Minari's episodes become tuples as ``erl_torch.experience.collect`` has them. Where an episode terminated, s' is the first state
-of the next one (the first episode follows the last); where it was truncated, or just ends, s' is the state reached.
-a' is the action taken next where the behaviour policy was the prior (``on_prior``) and an action was taken at s'; else
-it is drawn from the prior, with the stream "behaviour" of the seed, a number for each tuple.
+Minari's episodes become tuples as ``erl_torch.experience.collect`` has them. Where an episode terminated, s' is the
+first state of the next one (the first episode follows the last); where it was truncated, or just ends, s' is the
+state reached. a' is the action taken next where the behaviour policy was the prior (``on_prior``) and an action was
+taken at s'; else it is drawn from the prior, with the stream "behaviour" of the seed, a number for each tuple.
 """
 
 from __future__ import annotations

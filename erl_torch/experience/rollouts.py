@@ -90,9 +90,9 @@ def collect_rollouts(
 ) -> Transitions:
     """``erl_torch.collect`` in the original dynamics: episode after episode, as a stream of tuples.
 
-    Ends of episodes, a', seed and policies as in ``erl_torch.experience.collect``: where an episode terminates, s' is the
-    first state of the next. ``reward`` is "cyclic" (see ``rollout``) unless asked for: some originals pay the same for
-    every step.
+    Ends of episodes, a', seed and policies as in ``erl_torch.experience.collect``: where an episode terminates, s' is
+    the first state of the next. ``reward`` is "cyclic" (see ``rollout``) unless asked for: some originals pay the
+    same for every step.
 
     Raises:
         InputError: an argument out of range.

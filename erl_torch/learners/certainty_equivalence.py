@@ -1,8 +1,8 @@
 """Certainty equivalence: count, then solve the empirical model exactly. The yardstick of every tabular learner.
 
-Objective: the average reward minus KL(pi || prior)/beta, that of Algorithm S1; not optimistic. The optimum is over the
-visited pairs of the class of states that the stream shows (``erl_torch.empirical.counts``); states outside keep the prior.
-The policy's loss in the true MDP, g* - J, falls as 1/tuples: it is what the data allow.
+Objective: the average reward minus KL(pi || prior)/beta, that of Algorithm S1; not optimistic. The optimum is over
+the visited pairs of the class of states that the stream shows (``erl_torch.empirical.counts``); states outside keep
+the prior. The policy's loss in the true MDP, g* - J, falls as 1/tuples: it is what the data allow.
 
 The action a' of the stream is not used, and the stream may come from any behaviour policy.
 """

@@ -1,1 +1,1 @@
-""""""
+"""TensorBoard's event files, and the boards on them."""

@@ -1,1 +1,1 @@
-""""""
+"""A run in a directory: built from a configuration, looped, checkpointed, reported."""

@@ -9,10 +9,11 @@ whatever the chain; of the second the states suffice that pi comes back to for e
 regularised reward of pi_V with the difference V(s') - V(s) added, which averages to nothing under a stationary
 distribution; and of all policies pi_V has the largest such reward in every state.
 
-The compiled rows (``certificate_kernels.gain_rows``, ``certificate_kernels.policy_gain_rows``) return each gain with a lower and an upper end
-that rounding cannot leave: E V - V(s) is a sum of p (V(s') - V(s)) over s' other than s, so that no digit is lost where
-a state is rarely left, and the error of an action counts as far as it is chosen (docs/theory.md, 6: every operation).
-The rows of transition, prior and policy are meant as divided by their sums, which are 1 but for rounding.
+The compiled rows (``certificate_kernels.gain_rows``, ``certificate_kernels.policy_gain_rows``) return each gain with
+a lower and an upper end that rounding cannot leave: E V - V(s) is a sum of p (V(s') - V(s)) over s' other than s, so
+that no digit is lost where a state is rarely left, and the error of an action counts as far as it is chosen
+(docs/theory.md, 6: every operation). The rows of transition, prior and policy are meant as divided by their sums,
+which are 1 but for rounding.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""Compiled loops of the exact solvers: elimination without subtraction, Newton's method on a fixed pattern, tilted dynamics.
+"""Compiled loops of the exact solvers: elimination without subtraction, Newton's method on a fixed pattern, tilted
+dynamics.
 
 Kernels take plain C-contiguous arrays and scalars, use no globals, and validate nothing: the callers do.
 ``error_model="numpy"``: a division by zero gives inf or nan for the caller to find, and no check costs time.

@@ -1,1 +1,1 @@
-""""""
+"""Learners of action values, as baselines."""

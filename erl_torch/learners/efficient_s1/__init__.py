@@ -1,1 +1,1 @@
-""""""
+"""EfficientS1: the same fixed point at the limit of the data, by streaming."""

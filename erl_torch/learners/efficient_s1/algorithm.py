@@ -884,8 +884,8 @@ SWITCHES = (
 def certificate(part: EmpiricalProblem, log_psi: np.ndarray, policy: np.ndarray) -> tuple[float, float]:
     """(min(T_pi V - V), max(TV - V)) on the empirical problem, V = -log(psi)/beta: J(pi) and g* there lie between.
 
-    Bounds with their rounding (``erl_torch.solvers.certificates``), for the problem as its numbers stand. What ``policy``
-    [S, A] does in pairs that take no part is left out, and the rest normalised.
+    Bounds with their rounding (``erl_torch.solvers.certificates``), for the problem as its numbers stand. What
+    ``policy`` [S, A] does in pairs that take no part is left out, and the rest normalised.
     """
     problem = part.problem
     value = -log_psi[problem.states] / problem.beta

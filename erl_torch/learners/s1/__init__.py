@@ -1,1 +1,1 @@
-""""""
+"""Published Algorithm S1: one stream, or many side by side."""

@@ -1,0 +1,96 @@
+"""Imports run down only: a folder stands on the folders below it, and no import inside a function hides a circle."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1] / "erl_torch"
+# From the ground up; a folder may import from those on lines above its own.
+FLOORS = (
+    {"checks", "notes", "output", "rng", "files", "pictures", "log"},
+    {"solution", "mdp"},
+    {"envs", "solvers"},
+    {"experience"},
+    {"empirical", "evaluation"},
+    {"learners"},
+    {"run"},
+    {"reproduction"},
+    {"cli"},
+)
+BESIDE = {("files", "checks"), ("rng", "checks"), ("log", "files"), ("log", "checks"), ("solution", "mdp")}
+# The loop that samples as it learns; one call for each of them would cost a tenth of it.
+ACROSS = {("learners.s1.kernels", "experience.kernels")}
+
+
+def modules():
+    for path in sorted(ROOT.rglob("*.py")):
+        yield ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix("__init__").rstrip("."), path
+
+
+NAMES = {name for name, _ in modules()}
+
+
+def imported(path):
+    """Modules of the package, relative to it, that ``path`` imports anywhere."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "erl_torch":
+            base = node.module.removeprefix("erl_torch").lstrip(".")
+            for alias in node.names:
+                full = f"{base}.{alias.name}".lstrip(".")
+                yield full if full in NAMES else base
+        elif isinstance(node, ast.Import):
+            for alias in node.names:
+                if alias.name.split(".")[0] == "erl_torch":
+                    yield alias.name.removeprefix("erl_torch").lstrip(".")
+
+
+def room(name):
+    return name.split(".")[0]
+
+
+FLOOR = {one: floor for floor, rooms in enumerate(FLOORS) for one in rooms}
+
+
+@pytest.mark.parametrize("name", sorted(NAMES - {""}))
+def test_imports_run_down(name):
+    path = dict(modules())[name]
+    for other in imported(path):
+        if other and room(other) != room(name):
+            down = FLOOR[room(other)] < FLOOR[room(name)] or (room(name), room(other)) in BESIDE
+            assert down, f"{name} imports {other}"
+
+
+def test_there_is_no_circle():
+    graph = {name: {o for o in imported(path) if o != name and o} for name, path in modules() if name}
+    done, now = set(), []
+
+    def visit(name):
+        assert name not in now, f"{now[now.index(name) :]} import each other"
+        if name not in done:
+            now.append(name)
+            for other in graph.get(name, ()):
+                visit(other)
+            now.pop()
+            done.add(name)
+
+    for name in graph:
+        visit(name)
+
+
+def test_kernels_call_those_of_their_own_file():
+    """Numba's cache does not notice a changed kernel in another file."""
+    for name, path in modules():
+        if name.endswith("kernels"):
+            assert {(name, other) for other in imported(path)} <= ACROSS
+
+
+CONFIGURED = {"hydra": {"cli"}, "omegaconf": {"cli", "run", "reproduction", "log", "files"}}
+
+
+@pytest.mark.parametrize("library", CONFIGURED)
+def test_configuration_stays_above(library):
+    for name, path in modules():
+        text = path.read_text()
+        if f"import {library}" in text or f"from {library}" in text:
+            assert room(name) in CONFIGURED[library], name
