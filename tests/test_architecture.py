@@ -1,6 +1,8 @@
 """Imports run down only: a folder stands on the folders below it, and no import inside a function hides a circle."""
 
 import ast
+import re
+import zlib
 from pathlib import Path
 
 import pytest
@@ -94,3 +96,11 @@ def test_configuration_stays_above(library):
         text = path.read_text()
         if f"import {library}" in text or f"from {library}" in text:
             assert room(name) in CONFIGURED[library], name
+
+
+def test_the_loop_that_samples_is_compiled_anew():
+    """Its own cache does not see that the sampling has changed; the checksum in its file does."""
+    text = (ROOT / "learners/s1/kernels.py").read_text()
+    assert int(re.search(r"# experience/kernels.py: (\d+)", text)[1]) == zlib.crc32(
+        (ROOT / "experience/kernels.py").read_bytes()
+    ), "write the new number there"

@@ -109,7 +109,7 @@ def job(work: Callable[[DictConfig, Path, Callable[[], None]], Any]) -> Callable
         except Exception as error:
             if not expected(error):
                 raise
-            raise SystemExit(_report(error)) from error
+            raise SystemExit(report(error)) from error
 
     return task
 
@@ -194,7 +194,7 @@ def run(main: Callable[[], Any], about: str, conf: Path, config_name: str) -> No
     try:
         arguments = _resumed(typed)
     except InputError as error:
-        raise SystemExit(_report(error)) from None
+        raise SystemExit(report(error)) from None
     # Keys that no schema lists need Hydra's "++"; the user need not know.
     arguments = [f"++{a}" if a.startswith(OPEN_NODES) else a for a in arguments]
     arguments = [b for a in arguments for b in _by_id(a, conf)]
@@ -229,7 +229,7 @@ def run(main: Callable[[], Any], about: str, conf: Path, config_name: str) -> No
             raise SystemExit(1) from None  # a sweeper has nothing to choose from, and says so in its own way
         if full or not expected(error):
             raise
-        raise SystemExit(_report(error)) from None
+        raise SystemExit(report(error)) from None
     if sweeps.failures(rows):
         raise SystemExit(1)
 
@@ -291,7 +291,7 @@ def _help(about: str, conf: Path, config_name: str, overrides: list[str]) -> str
     return "\n".join(head) + "\n" + OmegaConf.to_yaml(cfg).rstrip()
 
 
-def _report(error: Exception) -> int:
+def report(error: Exception) -> int:
     """Print the one line; the exit code."""
     print(f"error: {_line(error)}", file=sys.stderr)
     return 2 if isinstance(error, OverrideParseException) else 1

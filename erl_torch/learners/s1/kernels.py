@@ -20,6 +20,8 @@ import numba
 import numpy as np
 from numba.extending import intrinsic
 
+# Numba looks at this file alone to see whether it has changed: the other's checksum changes it.
+# experience/kernels.py: 324154407
 from erl_torch.experience.kernels import sample_rows
 
 

@@ -1,0 +1,1 @@
+"""The configurations, installed as ``erl_torch.conf``."""
