@@ -1,8 +1,4 @@
-"""What a policy is worth: returns, reward rate and the regularised objective.
-
-``objective`` is J(pi) = reward rate - KL rate / beta, with KL(pi(.|s) || prior(.|s)) averaged over the
-states the policy visits; its maximum over policies is -theta*.
-"""
+"""Policies judged: by a known model (``erl_torch.solvers.policy``) or by playing, and beside the optimum."""
 
 from __future__ import annotations
 

@@ -427,9 +427,3 @@ class _Solving:
 
     def uncertainty(self, prior: np.ndarray) -> None:
         """There are no data."""
-
-
-# -- from configuration to objects ------------------------------------------------------------------
-
-
-# -- what is shown ----------------------------------------------------------------------------------
