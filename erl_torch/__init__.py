@@ -6,10 +6,10 @@ import itself stays light.
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import erl_torch.envs  # noqa: F401  (registers the environments)
+from erl_torch.lazy import loader
 
 if TYPE_CHECKING:
     from erl_torch.checks import InputError
@@ -122,10 +122,7 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        raise AttributeError(f"module 'erl_torch' has no attribute '{name}'")
-    return getattr(importlib.import_module(f"erl_torch.{_HOME[name]}"), name)
+__getattr__ = loader(__name__, _HOME)
 
 
 def __dir__() -> list[str]:

@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 
 from erl_torch import InputError, Status, TabularMDP, Transitions, collect, solve_soft_bellman
 from erl_torch.envs.windy_cliff import WindyCliffEnv
-from erl_torch.evaluation import measure, optimum
 from erl_torch.learners import LEARNERS, DifferentialSoftQ, QLearning, RVISoftQ, Sarsa, SoftQ, ULearning, ZLearning
 from erl_torch.learners.action_value import kernels as action_value_kernels
 from erl_torch.solvers import kernels as solvers_kernels
 from erl_torch.solvers.chains import RegenerativeLU
+from erl_torch.solvers.optimum import measure, optimum
 
 AVERAGE = (DifferentialSoftQ, RVISoftQ)
 OPTIMISTIC = (ULearning, ZLearning)

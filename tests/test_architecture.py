@@ -2,6 +2,8 @@
 
 import ast
 import re
+import subprocess
+import sys
 import zlib
 from pathlib import Path
 
@@ -10,7 +12,7 @@ import pytest
 ROOT = Path(__file__).parents[1] / "erl_torch"
 # From the ground up; a folder may import from those on lines above its own.
 FLOORS = (
-    {"checks", "notes", "output", "rng", "files", "pictures", "log"},
+    {"lazy", "checks", "notes", "output", "rng", "files", "pictures", "log"},
     {"solution", "mdp"},
     {"envs", "solvers"},
     {"experience"},
@@ -104,3 +106,21 @@ def test_the_loop_that_samples_is_compiled_anew():
     assert int(re.search(r"# experience/kernels.py: (\d+)", text)[1]) == zlib.crc32(
         (ROOT / "experience/kernels.py").read_bytes()
     ), "write the new number there"
+
+
+def test_copies_of_kernels_are_copies():
+    """A helper of kernels in two rooms stands in both files, the same: what is proven of one holds for the other."""
+    found = {}
+    for name, path in modules():
+        if name.endswith("kernels"):
+            text = path.read_text()
+            for node in ast.parse(text).body:
+                if isinstance(node, ast.FunctionDef):
+                    found.setdefault(node.name, set()).add(ast.get_source_segment(text, node))
+    assert {name for name, sources in found.items() if len(sources) > 1} == set()
+
+
+@pytest.mark.parametrize("name", ["TabularMDP", "Transitions", "collect", "evaluate", "tabular_mdp"])
+def test_names_that_need_no_torch_do_not_load_it(name):
+    code = f"import sys, erl_torch; erl_torch.{name}; assert 'torch' not in sys.modules"
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT.parent).returncode == 0

@@ -12,9 +12,9 @@ from matplotlib.image import imread
 from erl_torch import AlgorithmS1, InputError, TabularMDP, collect, pictures, solve_soft_bellman
 from erl_torch.cli import config
 from erl_torch.cli import main as cli
-from erl_torch.evaluation import measure, optimum
 from erl_torch.learners import LEARNERS, DifferentialSoftQ, SoftQ
 from erl_torch.run.compare import MEASURES, compare, interquartile_mean, iqm_interval, run_comparison
+from erl_torch.solvers.optimum import measure, optimum
 from erl_torch.solvers.policy import objective
 
 SMALL = ("experience.n_episodes=4", "experience.episode_length=500", "seeds=2", "n_sizes=2")

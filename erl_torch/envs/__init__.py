@@ -5,10 +5,11 @@ Importing this module registers them; the environments' own modules load when on
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from gymnasium.envs.registration import register, registry
+
+from erl_torch.lazy import loader
 
 if TYPE_CHECKING:
     from erl_torch.envs.discretise import Discretise, UniformBins
@@ -69,7 +70,4 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        raise AttributeError(f"module 'erl_torch.envs' has no attribute '{name}'")
-    return getattr(importlib.import_module(f"erl_torch.envs.{_HOME[name]}"), name)
+__getattr__ = loader(__name__, _HOME)

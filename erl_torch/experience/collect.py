@@ -17,6 +17,7 @@ real transitions enter the stream.
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -27,9 +28,7 @@ from gymnasium.vector import AutoresetMode
 
 from erl_torch import checks
 from erl_torch.checks import InputError
-from erl_torch.envs.control import ControlEnv
 from erl_torch.experience.recording import ColumnWriter, save_columns
-from erl_torch.experience.rollouts import episodes_of
 from erl_torch.experience.sampling import Sampler
 from erl_torch.experience.transitions import Transitions, join
 from erl_torch.mdp.from_gymnasium import changed_by, known_mdp, sizes
@@ -177,8 +176,11 @@ def record(
 def batched(env: gym.Env[Any, Any]) -> Callable[..., Transitions] | None:
     """What plays many episodes of ``env`` at once, if something can and it is not wrapped in something else."""
     base = env.unwrapped
-    if not isinstance(base, ControlEnv) or changed_by(env) is not None:
+    control = sys.modules.get("erl_torch.envs.control")  # which loads torch: there where there is such an environment
+    if control is None or not isinstance(base, control.ControlEnv) or changed_by(env) is not None:
         return None
+    from erl_torch.experience.rollouts import episodes_of
+
     longest = env.spec.max_episode_steps if env.spec else None
 
     def collect_at_once(n_episodes: int, episode_length: int, **arguments: Any) -> Transitions:

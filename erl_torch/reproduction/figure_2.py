@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 from erl_torch import iterate_biasing
 from erl_torch.envs.grid_pictures import draw_grid, shares
 from erl_torch.envs.mazes import random_maze
-from erl_torch.evaluation import optimum
 from erl_torch.pictures import COLOURS
 from erl_torch.reproduction.artifact import (
     NOT_REPRODUCED,
@@ -22,6 +21,7 @@ from erl_torch.reproduction.artifact import (
     Results,
     Units,
 )
+from erl_torch.solvers.optimum import optimum
 from erl_torch.solvers.policy import induced_distribution, kl_per_state
 
 SIZE, TRAPS, WIND_LEVEL, BETA = 10, 10, 2.0, 30.0

@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 
 from erl_torch import AlgorithmS1, CertaintyEquivalence, EfficientS1, collect, iterate_biasing
 from erl_torch.envs.windy_cliff import WindyCliffEnv
-from erl_torch.evaluation import measure, optimum
 from erl_torch.learners import DifferentialSoftQ
 from erl_torch.pictures import COLOURS
 from erl_torch.reproduction.artifact import (
@@ -24,6 +23,7 @@ from erl_torch.reproduction.artifact import (
     compared,
     compared_samples,
 )
+from erl_torch.solvers.optimum import measure, optimum
 from erl_torch.solvers.policy import objective, reward_per_step
 
 BETA, HORIZON = 10.0, 1000

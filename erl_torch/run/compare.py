@@ -35,7 +35,6 @@ from tqdm import tqdm
 
 from erl_torch import checks, pictures
 from erl_torch.checks import InputError
-from erl_torch.evaluation import Optimum, measure, optimum
 from erl_torch.experience.collect import collect
 from erl_torch.files import read_npy, write_json, write_png
 from erl_torch.learners import LEARNERS
@@ -45,6 +44,7 @@ from erl_torch.notes import collected
 from erl_torch.run.build import make_env, make_learner, make_world
 from erl_torch.run.settings import check_comparison_keys
 from erl_torch.solution import Status
+from erl_torch.solvers.optimum import Optimum, measure, optimum
 
 MEASURES = ("gap", "kl", "kl_states", "theta_error", "n_steps", "seconds")
 LEVEL = 0.95  # of the intervals
