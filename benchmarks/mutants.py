@@ -1487,14 +1487,14 @@ MUTANTS = [
     ),
     Mutant(
         "a gap is of the optimum's states",
-        "evaluation.py",
+        "solvers/optimum.py",
         "max(_mean(own, loss), 0.0) / beta",
         "max(_mean(best.stationary, loss), 0.0) / beta",
         "test_comparison.py::test_measures_are_their_definitions",
     ),
     Mutant(
         "KL of a comparison the other way round",
-        "evaluation.py",
+        "solvers/optimum.py",
         "kl = kl_per_state(best.policy, policy)",
         "kl = kl_per_state(policy, best.policy)",
         "test_comparison.py::test_measures_are_their_definitions",
@@ -1736,7 +1736,7 @@ MUTANTS = [
     Mutant(
         "luck is a sum over actions",
         "empirical/uncertainty.py",
-        "special.logsumexp(exponent, axis=2) - np.log(tied.sum(1))",
+        "special.logsumexp(exponent, axis=2) - np.log(tied[undecided].sum(1))",
         "special.logsumexp(exponent, axis=2)",
         "test_interval_rules.py::test_luck_of_two_arms",
     ),

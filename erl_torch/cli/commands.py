@@ -16,7 +16,6 @@ import hydra
 from omegaconf import DictConfig
 
 import erl_torch
-from erl_torch.cli import config
 from erl_torch.cli import main as cli
 from erl_torch.reproduction import ARTIFACTS
 
@@ -62,7 +61,6 @@ def _conf() -> Path:
 
 
 CONF = _conf()
-config.register()
 
 
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="train")
@@ -122,7 +120,12 @@ def reproduce() -> None:
     cli.run(_reproduce, "\n".join([REPRODUCE, "Artifacts:", *names]), CONF, "reproduce")
 
 
-COMMANDS = {"train": train, "compare": compare, "play": play, "reproduce": reproduce}
+COMMANDS = {
+    "train": (train, TRAIN),
+    "compare": (compare, COMPARE),
+    "play": (play, PLAY),
+    "reproduce": (reproduce, REPRODUCE),
+}
 
 
 def main() -> None:
@@ -130,17 +133,13 @@ def main() -> None:
     if len(sys.argv) < 2 or sys.argv[1] not in COMMANDS:
         given = sys.argv[1] if len(sys.argv) > 1 else ""
         asked = given in ("-h", "--help")
-        lines = [f"erl-torch {name} ...    {text.splitlines()[0]}" for name, text in _about().items()]
+        lines = [f"erl-torch {name} ...    {text.splitlines()[0]}" for name, (_, text) in COMMANDS.items()]
         if not asked:
             print(f"error: {given or 'no command'}: must be one of {', '.join(COMMANDS)}", file=sys.stderr)
         print("\n".join(lines), file=sys.stdout if asked else sys.stderr)
         raise SystemExit(0 if asked else 2)
-    command = COMMANDS[sys.argv.pop(1)]
+    command, _ = COMMANDS[sys.argv.pop(1)]
     command()
-
-
-def _about() -> dict[str, str]:
-    return {"train": TRAIN, "compare": COMPARE, "play": PLAY, "reproduce": REPRODUCE}
 
 
 if __name__ == "__main__":

@@ -37,6 +37,12 @@ NO_CHANCE = 0.02  # of the range of rewards: so far theta may be from that of da
 FAR = 10.0  # half widths of the 95% interval, from which a learnt theta is far from the data's
 
 
+CLOSER = (
+    "more passes or other steps come closer, if the learner solves the same problem (docs/learners.md); "
+    "learner=certainty_equivalence does"
+)
+
+
 class Reservation(NamedTuple):
     """``kind`` is the same for all runs that have it; ``text`` has the figures of one."""
 
@@ -187,14 +193,7 @@ def of_model(
     """Whether the data can come from ``mdp``: transitions, mean rewards and, where given, theta with its error."""
     said = [*_transitions(counted.tally, mdp), *_rewards(counted, mdp)]
     if estimate is not None and bounds is not None and _covered(counted.tally, mdp):
-        low, high = estimate.interval(1 - LEVEL)
-        # So far out no interval is exact: it has to be far in units of the usual one too.
-        far = min(half_widths(bound, estimate) for bound in bounds) > FAR
-        if far and (low > bounds[1] or high < bounds[0]):
-            said.append(
-                f"their theta is {estimate.value:.6g}, standard error {estimate.standard_error:.2g}, "
-                f"the model's {proven(bounds, None)}"
-            )
+        said += _theta(estimate, bounds)
     if not said:
         return []
     text = f"the data contradict the model: {'; '.join(said)}. What is proven is of the model alone"
@@ -253,6 +252,18 @@ def _rewards(counted: Counted, mdp: TabularMDP) -> Iterator[str]:
         yield (
             f"mean rewards of {differs.sum()} of {(visits > 0).sum()} pairs are others, as {mean[s, a]:.6g} for "
             f"{known[s, a]:.6g} at s={s}, a={a}"
+        )
+
+
+def _theta(estimate: Estimate, bounds: tuple[float, float]) -> Iterator[str]:
+    """Out at LEVEL no interval is exact: the model's theta has to be far in units of the usual one too."""
+    if not min(half_widths(bound, estimate) for bound in bounds) > FAR:
+        return
+    low, high = estimate.interval(1 - LEVEL)
+    if low > bounds[1] or high < bounds[0]:
+        yield (
+            f"their theta is {estimate.value:.6g}, standard error {estimate.standard_error:.2g}, "
+            f"the model's {proven(bounds, None)}"
         )
 
 
@@ -330,8 +341,7 @@ def of_theta(theta: float | None, rewards: tuple[float, float], estimate: Estima
             Reservation(
                 "theta far from the data's",
                 f"the learnt theta is {theta:.6g}, and that of the data, in which nothing is left to chance, is "
-                f"{estimate.value:.6g}: more passes or other steps come closer, if the learner solves the same problem "
-                "(docs/learners.md); learner=certainty_equivalence does",
+                f"{estimate.value:.6g}: {CLOSER}",
             )
         ]
     if not away > FAR:
@@ -342,9 +352,8 @@ def of_theta(theta: float | None, rewards: tuple[float, float], estimate: Estima
     return [
         Reservation(
             "theta far from the data's",
-            f"the learnt theta {theta:.6g} is {away:.3g} half widths from what the data say, {estimate} (95%): more "
-            "passes or other steps come closer, if the learner solves the same problem (docs/learners.md); "
-            "learner=certainty_equivalence does",
+            f"the learnt theta {theta:.6g} is {away:.3g} half widths from what the data say, {estimate} (95%): "
+            f"{CLOSER}",
         )
     ]
 

@@ -566,11 +566,16 @@ def _luck(part: EmpiricalProblem, here: _Worth, rows: _Rows, policy: np.ndarray)
     tied = worth.max(1)[:, None] - worth <= TIED * np.sqrt(together)
     tied &= problem.beta**2 * together > 1  # else the second order has it
     np.put_along_axis(tied, best[:, None], True, 1)
-    draws = np.random.default_rng(0).standard_normal((SIGNS, 1, problem.n_actions)) * np.sqrt(noise)
-    exponent = np.where(tied, problem.beta * draws, -np.inf)
-    gained = (special.logsumexp(exponent, axis=2) - np.log(tied.sum(1))).mean(0) / problem.beta
-    had = 0.5 * problem.beta * (policy * (1 - policy) * noise).sum(1)
-    return float((here.d.sum(1) * np.where(tied.sum(1) > 1, np.maximum(gained - had, 0.0), 0.0)).sum())
+    undecided = np.flatnonzero(tied.sum(1) > 1)
+    if not undecided.size:
+        return 0.0
+    draws = np.random.default_rng(0).standard_normal((SIGNS, 1, problem.n_actions)) * np.sqrt(noise[undecided])
+    exponent = np.where(tied[undecided], problem.beta * draws, -np.inf)
+    gained = (special.logsumexp(exponent, axis=2) - np.log(tied[undecided].sum(1))).mean(0) / problem.beta
+    had = 0.5 * problem.beta * (policy * (1 - policy) * noise).sum(1)[undecided]
+    luck = np.zeros(problem.n_states)
+    luck[undecided] = np.maximum(gained - had, 0.0)
+    return float((here.d.sum(1) * luck).sum())
 
 
 def _withheld(variance: float, bias: float, untried: float) -> str:
