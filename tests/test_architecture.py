@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[1] / "erl_torch"
 # From the ground up; a folder may import from those on lines above its own.
 FLOORS = (
     {"lazy", "checks", "notes", "output", "rng", "files", "pictures", "log"},
-    {"solution", "mdp"},
+    {"solution", "mdp", "problem"},
     {"envs", "solvers"},
     {"experience"},
     {"empirical", "evaluation"},
@@ -22,7 +22,7 @@ FLOORS = (
     {"reproduction"},
     {"cli"},
 )
-BESIDE = {("files", "checks"), ("rng", "checks"), ("log", "files"), ("log", "checks"), ("solution", "mdp")}
+BESIDE = {("files", "checks"), ("rng", "checks"), ("log", "files"), ("log", "checks"), ("solution", "mdp"), ("problem", "mdp")}
 # The loop that samples as it learns; one call for each of them would cost a tenth of it.
 ACROSS = {("learners.s1.kernels", "experience.kernels")}
 

@@ -1,0 +1,44 @@
+"""What there is to learn: ``Problem``; and what is learnt: ``Policy``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import gymnasium as gym
+import numpy as np
+import torch
+
+from erl_torch.mdp.tabular import TabularMDP
+
+Policy: TypeAlias = torch.Tensor
+"""Probabilities of the actions in each state: [S, A], every row sums to 1; [R, S, A] of R replicas."""
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """An environment with finite spaces, and what is known of it.
+
+    Args:
+        env: where policies are played.
+        source: where experience is collected: ``env``, or a model in its place.
+        prior: the prior policy, [S, A], entries > 0, rows sum to 1.
+        mdp: the model that policies are evaluated on, and that is solved to compare with; None where it is not known.
+        episode: the model of one episode: its end is absorbed, without reward; None where there is none.
+        horizon: steps of an episode at most, >= 1.
+    """
+
+    env: gym.Env[Any, Any]
+    source: TabularMDP | gym.Env[Any, Any]
+    prior: np.ndarray
+    mdp: TabularMDP | None = None
+    episode: TabularMDP | None = None
+    horizon: int = 1000
+
+    @property
+    def n_states(self) -> int:
+        return int(self.prior.shape[0])
+
+    @property
+    def n_actions(self) -> int:
+        return int(self.prior.shape[1])
