@@ -29,8 +29,8 @@ import torch
 from erl_torch import AlgorithmS1, CertaintyEquivalence, EfficientS1, Transitions, collect
 from erl_torch.empirical import reservations
 from erl_torch.envs.windy_cliff import WindyCliffEnv
+from erl_torch.experience.experience import Experience
 from erl_torch.experience.recording import ColumnWriter, open_recording
-from erl_torch.experience.transitions import Recording
 from erl_torch.learners.s1 import kernels, listing
 from erl_torch.learners.s1.algorithm import S1Stream
 
@@ -163,7 +163,7 @@ def bench_notes() -> None:
         held = collect(env, 500, 1000, 0)
         with ColumnWriter(Path(directory) / "tuples") as writer:
             writer.append(collect(env, 5000, 1000, 0))
-        streams: dict[str, Recording] = {
+        streams: dict[str, Experience] = {
             "500,000 tuples, simulated": held,
             "5,000,000 tuples, recorded": open_recording(f"{directory}/tuples/", 15, 4),
         }
@@ -171,10 +171,10 @@ def bench_notes() -> None:
             for which, learner in learners.items():
                 next_actions = learner.drawn_from_prior == "a_next"
 
-                def count(data: Recording = data, next_actions: bool = next_actions) -> None:
+                def count(data: Experience = data, next_actions: bool = next_actions) -> None:
                     reservations.count(data, 15, 4, next_actions)
 
-                def fit(data: Recording = data, learner: Any = learner) -> None:
+                def fit(data: Experience = data, learner: Any = learner) -> None:
                     learner.fit(data, 15, 4)
 
                 seconds = medians({"pass": count, "fit": fit}, rounds=3)

@@ -1260,14 +1260,14 @@ MUTANTS = [
     ),
     Mutant(
         "a tuple's number is off by one a chunk",
-        "experience/transitions.py",
+        "experience/experience.py",
         "        t -= len(chunk)\n",
         "        t -= len(chunk) - 1\n",
         "test_streams.py::test_a_failure_names_its_tuple_wherever_it_is_read_from",
     ),
     Mutant(
         "a selection takes what is left out",
-        "experience/transitions.py",
+        "experience/experience.py",
         "(chunk.where(mask) for chunk, mask in found if mask.any())",
         "(chunk.where(~mask) for chunk, mask in found if not mask.all())",
         "test_streams.py::test_learners_do_not_see_how_a_stream_is_cut",

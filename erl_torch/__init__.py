@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import erl_torch.envs  # noqa: F401  (registers the environments)
-from erl_torch.lazy import loader
+from erl_torch.lazy import Renamed, loader
 
 if TYPE_CHECKING:
     from erl_torch.checks import InputError
@@ -18,10 +18,11 @@ if TYPE_CHECKING:
     from erl_torch.envs.estimate import EstimatedModel, estimate_mdp
     from erl_torch.evaluation import Evaluation, evaluate
     from erl_torch.experience.collect import collect, record
+    from erl_torch.experience.experience import Experience
     from erl_torch.experience.recording import FileRecording, open_recording, save_columns
     from erl_torch.experience.rollouts import collect_rollouts, rollout
     from erl_torch.experience.simulation import Simulation
-    from erl_torch.experience.transitions import Recording, Transitions
+    from erl_torch.experience.transitions import Transitions
     from erl_torch.learners.certainty_equivalence import CertaintyEquivalence
     from erl_torch.learners.efficient_s1.algorithm import EfficientS1
     from erl_torch.learners.learner import NonFiniteError
@@ -43,7 +44,7 @@ _HOME = {
     "EmpiricalMDP": "empirical.counts",
     "Estimate": "empirical.uncertainty",
     "FileRecording": "experience.recording",
-    "Recording": "experience.transitions",
+    "Experience": "experience.experience",
     "Evaluation": "evaluation",
     "InputError": "checks",
     "ListedS1": "learners.s1.algorithm",
@@ -78,6 +79,8 @@ _HOME = {
     "theta_uncertainty": "empirical.uncertainty",
 }
 
+_RENAMED = {"Recording": Renamed("experience.experience", "Experience", "erl_torch.Experience")}
+
 __all__ = [
     "AlgorithmS1",
     "CertaintyEquivalence",
@@ -86,13 +89,13 @@ __all__ = [
     "Estimate",
     "EstimatedModel",
     "Evaluation",
+    "Experience",
     "FileRecording",
     "InputError",
     "ListedS1",
     "MeanRewardWarning",
     "NonFiniteError",
     "Note",
-    "Recording",
     "ReplicaSolution",
     "Replicas",
     "S1State",
@@ -122,7 +125,7 @@ __all__ = [
 ]
 
 
-__getattr__ = loader(__name__, _HOME)
+__getattr__ = loader(__name__, _HOME, _RENAMED)
 
 
 def __dir__() -> list[str]:

@@ -31,8 +31,9 @@ from erl_torch import (
 )
 from erl_torch.empirical.counts import empirical_mdp, tally
 from erl_torch.envs.discretise import Discretise
+from erl_torch.experience.experience import Parts
 from erl_torch.experience.recording import ColumnWriter, _Minari, check_target
-from erl_torch.experience.transitions import COLUMNS, Parts, regroup
+from erl_torch.experience.transitions import COLUMNS, regroup
 from erl_torch.learners import LEARNERS
 from erl_torch.rng import streams
 from erl_torch.run.training import train

@@ -24,7 +24,7 @@ import scipy.sparse as sp
 from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.empirical import kernels
-from erl_torch.experience.transitions import Recording
+from erl_torch.experience.experience import Experience
 from erl_torch.mdp.tabular import check_prior, normalise_rows
 from erl_torch.solvers.chains import classes
 from erl_torch.solvers.problem import Problem
@@ -145,7 +145,7 @@ class Tally:
         return indptr, self.indices[kept], self.psi_weight[kept]
 
 
-def tally(data: Recording, n_states: int, n_actions: int, lr_psi: float = 0.0) -> Tally:
+def tally(data: Experience, n_states: int, n_actions: int, lr_psi: float = 0.0) -> Tally:
     """Count a stream: to the same bits, however it is cut.
 
     Args:
@@ -156,7 +156,7 @@ def tally(data: Recording, n_states: int, n_actions: int, lr_psi: float = 0.0) -
     Raises:
         InputError: naming the first tuple with a state or action out of range.
     """
-    checks.instance("transitions", data, Recording, "a recording, as of Transitions or open_recording")
+    checks.instance("transitions", data, Experience, "a recording, as of Transitions or open_recording")
     data.check_range(n_states, n_actions)
     n_pairs = n_states * n_actions
     if n_pairs > np.iinfo(np.int32).max:
@@ -204,7 +204,7 @@ def _table(keys: np.ndarray, used: int, size: int) -> tuple[np.ndarray, int]:
     return table, shift
 
 
-def empirical_mdp(data: Recording, n_states: int, n_actions: int, found: Tally | None = None) -> EmpiricalMDP:
+def empirical_mdp(data: Experience, n_states: int, n_actions: int, found: Tally | None = None) -> EmpiricalMDP:
     """Counts and mean rewards of a stream: one pass over it, and two more where rewards vary.
 
     Args:

@@ -23,7 +23,8 @@ from scipy.special import rel_entr
 from erl_torch.checks import InputError
 from erl_torch.empirical.counts import EmpiricalMDP, Tally, empirical_mdp, tally
 from erl_torch.empirical.uncertainty import Estimate
-from erl_torch.experience.transitions import Recording, Transitions
+from erl_torch.experience.experience import Experience
+from erl_torch.experience.transitions import Transitions
 from erl_torch.mdp.tabular import TabularMDP
 from erl_torch.solution import Status, proven
 from erl_torch.solvers.chains import reachable_from
@@ -62,7 +63,7 @@ class Counted:
 class _Passing:
     """A recording whose (s',a') are counted as it is read."""
 
-    def __init__(self, data: Recording, n_states: int, n_actions: int) -> None:
+    def __init__(self, data: Experience, n_states: int, n_actions: int) -> None:
         self.data, self.counts = data, np.zeros((n_states, n_actions), np.int64)
 
     def __len__(self) -> int:
@@ -82,7 +83,7 @@ class _Passing:
             yield chunk
 
 
-def count(data: Recording, n_states: int, n_actions: int, next_actions: bool) -> Counted:
+def count(data: Experience, n_states: int, n_actions: int, next_actions: bool) -> Counted:
     """Read ``data``; ``next_actions``: a' counts as well. Raises InputError as ``tally`` does."""
     passing = _Passing(data, n_states, n_actions) if next_actions else None
     found = tally(passing or data, n_states, n_actions)

@@ -39,7 +39,8 @@ from numpy.lib import format as npy
 from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.envs.discretise import Discretise
-from erl_torch.experience.transitions import COLUMNS, Checksum, Recording, Transitions, join, regroup
+from erl_torch.experience.experience import Experience
+from erl_torch.experience.transitions import COLUMNS, Checksum, Transitions, join, regroup
 from erl_torch.files import check_directory
 from erl_torch.mdp.tabular import check_policy
 from erl_torch.rng import streams
@@ -62,7 +63,7 @@ class Source(Protocol):
 
 
 class FileRecording:
-    """A ``Recording`` in files, read anew in every pass.
+    """A ``Experience`` in files, read anew in every pass.
 
     Args:
         path: see the module's docstring.
@@ -139,7 +140,7 @@ class FileRecording:
             raise InputError("n_states, n_actions", (n_states, n_actions), f"those it was opened with, {self._sizes}")
 
     def chunks(self, multiple: int = 1) -> Iterator[Transitions]:
-        """One pass; see ``Recording``. Raises InputError for a file that is no longer what it was."""
+        """One pass; see ``Experience``. Raises InputError for a file that is no longer what it was."""
         n = 0
         for part in regroup(self._read(max(1, min(self._chunk, READ) // multiple) * multiple), multiple):
             n += len(part)
@@ -561,9 +562,9 @@ def _our_npz(path: Path) -> bool:
         return False
 
 
-def save_columns(data: Recording, directory: str | os.PathLike[str]) -> Path:
+def save_columns(data: Experience, directory: str | os.PathLike[str]) -> Path:
     """Write a recording of any size to a directory of columns, which is the fastest to read."""
-    checks.instance("data", data, Recording, "a recording, as of Transitions or open_recording")
+    checks.instance("data", data, Experience, "a recording, as of Transitions or open_recording")
     with ColumnWriter(directory) as writer:
         for chunk in data.chunks():
             writer.append(chunk)

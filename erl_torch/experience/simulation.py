@@ -63,17 +63,17 @@ class Simulation:
         return collect(self.mdp, self.n_episodes, self.episode_length, seed, self.behaviour_policy, prior_policy)
 
 
-Experience = Transitions | Sequence[Transitions] | Simulation
+ReplicaExperience = Transitions | Sequence[Transitions] | Simulation
 
 
-def tuples_of(experience: Experience, r: int, prior: np.ndarray) -> Transitions:
+def tuples_of(experience: ReplicaExperience, r: int, prior: np.ndarray) -> Transitions:
     """The stream of one replica."""
     if isinstance(experience, Transitions):
         return experience
     return experience.stream(r, prior) if isinstance(experience, Simulation) else experience[r]
 
 
-def fits(experience: Experience, n_replicas: int, tuple_bytes: int) -> bool:
+def fits(experience: ReplicaExperience, n_replicas: int, tuple_bytes: int) -> bool:
     """Whether the tuples of all replicas are to be kept, at so many bytes each."""
     if isinstance(experience, Simulation):
         n_tuples = experience.n_tuples

@@ -1,17 +1,13 @@
-"""Experience: a stream of tuples (s, a, r, s', a').
-
-``Recording`` is what learners learn from: tuples that come in chunks, as often as asked. ``Transitions`` holds them in
-memory, as one chunk of five columns; ``erl_torch.experience.recording`` reads those of any size from files.
-"""
+"""Tuples (s, a, r, s', a') in memory: ``Transitions``, five columns of one length."""
 
 from __future__ import annotations
 
 import os
 import zlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
+from typing import Any
 
 import numpy as np
 
@@ -20,23 +16,6 @@ from erl_torch.checks import InputError
 from erl_torch.files import read_npz, write_npz
 
 COLUMNS = ("s", "a", "r", "s_next", "a_next")
-Part = TypeVar("Part")
-
-
-@runtime_checkable
-class Recording(Protocol):
-    """A stream of tuples of any size, the same in every pass."""
-
-    def __len__(self) -> int: ...
-
-    def check_range(self, n_states: int, n_actions: int) -> None:
-        """Raise InputError naming the first tuple with a state or action out of range."""
-
-    def chunks(self, multiple: int = 1) -> Iterator[Transitions]:
-        """One pass, in order. The lengths of all chunks but the last are multiples of ``multiple``."""
-
-    def checksum(self) -> int:
-        """Of all columns, however the stream is cut."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,43 +121,6 @@ class Checksum:
         return zlib.crc32(np.array(list(self.columns.values()), "<u4").tobytes())
 
 
-class Parts(Generic[Part]):
-    """What ``make`` makes of each chunk: once where the stream is in memory, else anew in every pass."""
-
-    def __init__(self, data: Recording, make: Callable[[Transitions], Part], multiple: int = 1) -> None:
-        self._data, self._make, self._multiple = data, make, multiple
-        self._whole = [make(data)] if isinstance(data, Transitions) else []
-
-    @property
-    def whole(self) -> Part:
-        """Of a stream in memory."""
-        return self._whole[0]
-
-    def __iter__(self) -> Iterator[Part]:
-        return iter(self._whole) if self._whole else map(self._make, self._data.chunks(self._multiple))
-
-
-class Selection:
-    """The tuples of a recording for which ``takes_part`` (chunk -> mask [n]) holds: ``n_tuples`` of them, above 0."""
-
-    def __init__(self, data: Recording, takes_part: Callable[[Transitions], np.ndarray], n_tuples: int) -> None:
-        self._data, self._takes_part, self._n = data, takes_part, n_tuples
-
-    def __len__(self) -> int:
-        return self._n
-
-    def check_range(self, n_states: int, n_actions: int) -> None:
-        self._data.check_range(n_states, n_actions)
-
-    def chunks(self, multiple: int = 1) -> Iterator[Transitions]:
-        found = ((chunk, self._takes_part(chunk)) for chunk in self._data.chunks())
-        return regroup((chunk.where(mask) for chunk, mask in found if mask.any()), multiple)
-
-    def checksum(self) -> int:
-        running = Checksum()
-        return [running.of(chunk) for chunk in self.chunks()][-1]
-
-
 def regroup(chunks: Iterable[Transitions], multiple: int) -> Iterator[Transitions]:
     """The same tuples in chunks of multiples of ``multiple``; the last holds what is left."""
     held: list[Transitions] = []
@@ -201,15 +143,6 @@ def join(chunks: list[Transitions]) -> Transitions:
     if len(chunks) == 1:
         return chunks[0]
     return Transitions.checked(*(np.concatenate([getattr(chunk, name) for chunk in chunks]) for name in COLUMNS))
-
-
-def tuple_at(data: Recording, t: int) -> tuple[int, int, float]:
-    """(s, a, r) of tuple ``t``."""
-    for chunk in data.chunks():
-        if t < len(chunk):
-            return int(chunk.s[t]), int(chunk.a[t]), float(chunk.r[t])
-        t -= len(chunk)
-    raise IndexError(t)
 
 
 def _column(name: str, value: Any) -> np.ndarray:

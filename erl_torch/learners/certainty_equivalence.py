@@ -19,7 +19,7 @@ import torch
 
 from erl_torch import checks
 from erl_torch.empirical.counts import EmpiricalMDP, EmpiricalProblem, empirical_mdp
-from erl_torch.experience.transitions import Recording
+from erl_torch.experience.experience import Experience
 from erl_torch.learners.learner import columns, epochs
 from erl_torch.mdp.tabular import check_policy
 from erl_torch.solution import Solution, Status, proven
@@ -97,14 +97,14 @@ class CertaintyEquivalence:
         checks.positive("tol", self.tol)
         checks.at_least("max_steps", self.max_steps, 1)
 
-    def fit(self, transitions: Recording, n_states: int, n_actions: int) -> Solution:
+    def fit(self, transitions: Experience, n_states: int, n_actions: int) -> Solution:
         """Count and solve. Status REDUCIBLE, with a message, where the states that the stream shows are not one
         recurrent class; theta is then that of the closed set of states (of several, the most visited)."""
         (state,) = self.iterate(transitions, n_states, n_actions)
         return self.solution(state, [state.metrics()])
 
     def iterate(
-        self, transitions: Recording, n_states: int, n_actions: int, state: CertaintyEquivalenceState | None = None
+        self, transitions: Experience, n_states: int, n_actions: int, state: CertaintyEquivalenceState | None = None
     ) -> Iterator[CertaintyEquivalenceState]:
         """Yield the one state."""
         yield from epochs(self, transitions, n_states, n_actions, state)
@@ -119,7 +119,7 @@ class CertaintyEquivalence:
         zero, one = torch.zeros_like(prior), torch.ones_like(prior)
         return CertaintyEquivalenceState(0, 0, self.beta, prior, prior, one, 1.0, 0.0, zero, math.inf)
 
-    def prepare(self, transitions: Recording, n_states: int, n_actions: int) -> CertaintyEquivalenceStream:
+    def prepare(self, transitions: Experience, n_states: int, n_actions: int) -> CertaintyEquivalenceStream:
         """Count. Raises InputError for tuples out of range, or a stream that never returns to any state."""
         model = empirical_mdp(transitions, n_states, n_actions)
         return CertaintyEquivalenceStream(model, model.problem(self.beta, self.prior_policy), len(transitions))

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from erl_torch import checks
-from erl_torch.experience.transitions import Recording
+from erl_torch.experience.experience import Experience
 from erl_torch.solution import Solution
 
 
@@ -23,12 +23,12 @@ class NonFiniteError(ArithmeticError):
         return f"step {self.step}: {self.cause}"
 
 
-def epochs(learner: Any, transitions: Recording, n_states: int, n_actions: int, state: Any = None) -> Iterator[Any]:
+def epochs(learner: Any, transitions: Experience, n_states: int, n_actions: int, state: Any = None) -> Iterator[Any]:
     """The states of ``learner`` after each epoch, from ``state`` on, until it is finished.
 
     Raises what its ``step`` raises.
     """
-    checks.instance("transitions", transitions, Recording, "a recording, as of Transitions or open_recording")
+    checks.instance("transitions", transitions, Experience, "a recording, as of Transitions or open_recording")
     stream = learner.prepare(transitions, n_states, n_actions)
     state = learner.init(n_states, n_actions) if state is None else state
     while not learner.finished(state):
@@ -41,7 +41,7 @@ def columns(rows: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
     return {name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())}
 
 
-def run_to_end(learner: Any, transitions: Recording, n_states: int, n_actions: int) -> Solution:
+def run_to_end(learner: Any, transitions: Experience, n_states: int, n_actions: int) -> Solution:
     """The solution of the last good state of ``learner.iterate``, with one ``metrics()`` of history for each."""
     state = learner.init(n_states, n_actions)
     history: list[dict[str, float]] = []

@@ -31,7 +31,7 @@ import torch
 
 from erl_torch import checks
 from erl_torch.checks import InputError
-from erl_torch.experience.simulation import Experience, Simulation, fits, tuples_of
+from erl_torch.experience.simulation import ReplicaExperience, Simulation, fits, tuples_of
 from erl_torch.experience.transitions import Transitions
 from erl_torch.files import read_npz, write_npz
 from erl_torch.learners.learner import NonFiniteError, columns
@@ -161,7 +161,7 @@ class Replicas(Together):
         own = [{name: _number(column[r]) for name, column in columns.items()} for r in range(n_replicas)]
         return cls(tuple(replace(learner, **values) for values in own), threads, block, layout, backend)
 
-    def fit(self, experience: Experience, n_states: int, n_actions: int) -> ReplicaSolution:
+    def fit(self, experience: ReplicaExperience, n_states: int, n_actions: int) -> ReplicaSolution:
         """Run all to the end. Raises InputError: what the learners raise, or streams that are not one a replica."""
         history: list[dict[str, np.ndarray]] = []
         state: ReplicaState | None = None
@@ -171,7 +171,7 @@ class Replicas(Together):
         return self.solution(state, history)
 
     def iterate(
-        self, experience: Experience, n_states: int, n_actions: int, state: Any = None
+        self, experience: ReplicaExperience, n_states: int, n_actions: int, state: Any = None
     ) -> Iterator[ReplicaState]:
         """Yield the state of all replicas after each epoch, from ``state`` on, until the last is done or has failed."""
         self._check(experience, n_states, n_actions)
@@ -191,7 +191,7 @@ class Replicas(Together):
             solutions.append(learner.solution(own, rows, state.failures.get(r)))
         return ReplicaSolution(tuple(solutions), state.failures)
 
-    def _check(self, experience: Experience, n_states: int, n_actions: int) -> None:
+    def _check(self, experience: ReplicaExperience, n_states: int, n_actions: int) -> None:
         prior = self.prior_policy(n_states, n_actions)
         for r, learner in enumerate(self.learners):
             own = learner.prior_policy
@@ -242,7 +242,7 @@ class EachState:
 
 
 def each(
-    replicas: Replicas, experience: Experience, n_states: int, n_actions: int, state: EachState | None = None
+    replicas: Replicas, experience: ReplicaExperience, n_states: int, n_actions: int, state: EachState | None = None
 ) -> Iterator[EachState]:
     """``Replicas.iterate`` of any learner that streams. Prepared streams are held where they fit, else made again."""
     learners, prior = replicas.learners, replicas.prior_policy(n_states, n_actions)

@@ -18,8 +18,8 @@ from erl_torch.checks import InputError
 from erl_torch.envs.discretise import Discretise
 from erl_torch.envs.estimate import estimate_mdp
 from erl_torch.experience.collect import collect, record
+from erl_torch.experience.experience import Experience
 from erl_torch.experience.recording import FileRecording, check_target, open_recording
-from erl_torch.experience.transitions import Recording
 from erl_torch.files import read_npy
 from erl_torch.learners import LEARNERS
 from erl_torch.mdp.from_gymnasium import MeanRewardWarning, absorbing, known_mdp, tabular_mdp
@@ -206,7 +206,7 @@ def collected_experience(
     rng: Streams,
     prior: np.ndarray,
     safe_point: Callable[[], None],
-) -> Recording:
+) -> Experience:
     with group("experience"):
         behaviour = None
         if cfg.behaviour_policy is not None:

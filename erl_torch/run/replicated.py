@@ -34,7 +34,7 @@ from erl_torch.empirical.uncertainty import Estimate
 from erl_torch.evaluation import Judge, evaluate
 from erl_torch.experience.collect import COLUMN_BYTES, collect
 from erl_torch.experience.recording import check_target, save_columns
-from erl_torch.experience.simulation import KEEP_BYTES, TUPLE_BYTES, Experience, Simulation
+from erl_torch.experience.simulation import KEEP_BYTES, TUPLE_BYTES, ReplicaExperience, Simulation
 from erl_torch.experience.transitions import Transitions
 from erl_torch.files import read_npy, write_json, write_png
 from erl_torch.learners import Exact, NonFiniteError
@@ -312,7 +312,7 @@ def _experience(
     n_actions: int,
     prior: np.ndarray,
     safe_point: SafePoint,
-) -> Experience:
+) -> ReplicaExperience:
     shared = cfg.shared_stream or cfg.experience.name == "recorded"
     if shared and cfg.n_replicas > 1:
         said = "1: on one stream, replicas with the same settings would be the same (let settings vary, vary.KEY=[...])"
@@ -352,7 +352,7 @@ def _recorded(experience: Transitions | Sequence[Transitions]) -> Sequence[Trans
     return [experience] if isinstance(experience, Transitions) else experience
 
 
-def _lengths(experience: Experience) -> list[int]:
+def _lengths(experience: ReplicaExperience) -> list[int]:
     if isinstance(experience, Simulation):
         return [experience.n_tuples]
     return [len(data) for data in _recorded(experience)]
@@ -439,7 +439,7 @@ class Data(NamedTuple):
 
 
 def _reservations(
-    experience: Experience,
+    experience: ReplicaExperience,
     learners: list[Any],
     prior: np.ndarray,
     model: TabularMDP | None,

@@ -26,7 +26,7 @@ from erl_torch.empirical import reservations
 from erl_torch.empirical.reservations import Reservation
 from erl_torch.empirical.uncertainty import Estimate
 from erl_torch.evaluation import Evaluation, evaluate
-from erl_torch.experience.transitions import Recording
+from erl_torch.experience.experience import Experience
 from erl_torch.files import write_json
 from erl_torch.learners import Exact, ExactState, NonFiniteError, S1State
 from erl_torch.learners.learner import columns
@@ -266,7 +266,7 @@ class _Learning:
         self.learner = learner
         self.sizes = sizes(world.source)
         self.n_skipped = 0
-        self.data: Recording
+        self.data: Experience
         if cfg.experience.name == "recorded":
             found = recorded(cfg.experience, env, *self.sizes, cfg.seed, prior, safe_point)
             self.data, self.n_skipped = found.held(), found.n_skipped

@@ -39,7 +39,8 @@ import torch
 
 from erl_torch import checks
 from erl_torch.checks import InputError
-from erl_torch.experience.transitions import Parts, Recording, Transitions
+from erl_torch.experience.experience import Experience, Parts
+from erl_torch.experience.transitions import Transitions
 from erl_torch.learners.action_value import kernels
 from erl_torch.learners.learner import NonFiniteError, columns, epochs, run_to_end
 from erl_torch.mdp.tabular import check_prior
@@ -96,7 +97,7 @@ class ActionValueState:
 class ActionValueStream:
     """A stream as the compiled loop takes it."""
 
-    data: Recording
+    data: Experience
     parts: Parts[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]  # s, s * A + a, s' and r, a chunk each
     reference: int  # state that is visited most
 
@@ -137,7 +138,7 @@ class ActionValueLearner:
             raise InputError("power", self.power, "a number in (0.5, 1]")
         checks.at_least("n_epochs", self.n_epochs, 1)
 
-    def fit(self, transitions: Recording, n_states: int, n_actions: int) -> Solution:
+    def fit(self, transitions: Experience, n_states: int, n_actions: int) -> Solution:
         """Run to the end and return the solution; Status.NON_FINITE with the last good pass if a table overflows.
 
         Raises InputError: a state or action out of range, or a prior policy of the wrong shape.
@@ -145,7 +146,7 @@ class ActionValueLearner:
         return run_to_end(self, transitions, n_states, n_actions)
 
     def iterate(
-        self, transitions: Recording, n_states: int, n_actions: int, state: ActionValueState | None = None
+        self, transitions: Experience, n_states: int, n_actions: int, state: ActionValueState | None = None
     ) -> Iterator[ActionValueState]:
         """Yield the state after each pass, n_epochs times. Raises NonFiniteError."""
         yield from epochs(self, transitions, n_states, n_actions, state)
@@ -186,7 +187,7 @@ class ActionValueLearner:
             rate=0.0 if self._discount == 1.0 else None,
         )
 
-    def prepare(self, transitions: Recording, n_states: int, n_actions: int) -> ActionValueStream:
+    def prepare(self, transitions: Experience, n_states: int, n_actions: int) -> ActionValueStream:
         """Validate the stream against the sizes."""
         transitions.check_range(n_states, n_actions)
         if n_states * n_actions > np.iinfo(np.int32).max:

@@ -83,7 +83,8 @@ from scipy.special import logsumexp, softmax
 from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.empirical.counts import EmpiricalMDP, EmpiricalProblem, empirical_mdp, tally
-from erl_torch.experience.transitions import Parts, Recording, Selection, Transitions
+from erl_torch.experience.experience import Experience, Parts, Selection
+from erl_torch.experience.transitions import Transitions
 from erl_torch.learners.efficient_s1 import kernels
 from erl_torch.learners.learner import NonFiniteError, columns, epochs, run_to_end
 from erl_torch.learners.s1.algorithm import BLOCK, LOG_PSI_EPSILON
@@ -361,7 +362,7 @@ class EfficientS1:
 
     # -- the whole run ------------------------------------------------------------------------------
 
-    def fit(self, transitions: Recording, n_states: int, n_actions: int) -> Solution:
+    def fit(self, transitions: Experience, n_states: int, n_actions: int) -> Solution:
         """Run to the end and return the solution.
 
         Status CONVERGED once certified, COMPLETED after n_bias iterations, UNCERTIFIED where the certificate is then
@@ -376,7 +377,7 @@ class EfficientS1:
         return run_to_end(self, transitions, n_states, n_actions)
 
     def iterate(
-        self, transitions: Recording, n_states: int, n_actions: int, state: EfficientState | None = None
+        self, transitions: Experience, n_states: int, n_actions: int, state: EfficientState | None = None
     ) -> Iterator[EfficientState]:
         """Yield the state after each epoch: n_bias * n_epochs times, or until certified."""
         yield from epochs(self, transitions, n_states, n_actions, state)
@@ -465,7 +466,7 @@ class EfficientS1:
             mean_log_psi=zero,
         )
 
-    def prepare(self, transitions: Recording, n_states: int, n_actions: int) -> EfficientStream:
+    def prepare(self, transitions: Experience, n_states: int, n_actions: int) -> EfficientStream:
         """Validate the stream against the sizes and compute what is the same in every epoch: one pass, or a few."""
         data, lr_psi = transitions, 0.0 if self.sample_mean_psi else self.lr_psi
         found = tally(data, n_states, n_actions, lr_psi)

@@ -73,7 +73,8 @@ import torch
 from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.empirical.counts import tally
-from erl_torch.experience.transitions import Parts, Recording, Transitions, tuple_at
+from erl_torch.experience.experience import Experience, Parts, tuple_at
+from erl_torch.experience.transitions import Transitions
 from erl_torch.learners.learner import NonFiniteError, columns, epochs, run_to_end
 from erl_torch.learners.s1 import kernels, listing
 from erl_torch.mdp.tabular import check_prior
@@ -138,7 +139,7 @@ class S1State:
 class S1Stream:
     """A stream made ready for the compiled loops: done once a fit."""
 
-    data: Recording
+    data: Experience
     visited: np.ndarray  # [S, A] bool
     parts: Parts[tuple[np.ndarray, np.ndarray, np.ndarray]]  # pair, pair_next and factor below, a chunk each
     reward: np.ndarray  # [S*A]; all 0 where `noisy`
@@ -237,7 +238,7 @@ class AlgorithmS1:
 
     # -- the whole run ------------------------------------------------------------------------------
 
-    def fit(self, transitions: Recording, n_states: int, n_actions: int) -> Solution:
+    def fit(self, transitions: Experience, n_states: int, n_actions: int) -> Solution:
         """Run to the end and return the solution.
 
         A run that leaves the finite numbers ends with ``Status.NON_FINITE``, the tables of the last good
@@ -249,7 +250,7 @@ class AlgorithmS1:
         return run_to_end(self, transitions, n_states, n_actions)
 
     def iterate(
-        self, transitions: Recording, n_states: int, n_actions: int, state: S1State | None = None
+        self, transitions: Experience, n_states: int, n_actions: int, state: S1State | None = None
     ) -> Iterator[S1State]:
         """Yield the state after each epoch of the u phase: n_bias * n_epochs times, or what is left after ``state``.
 
@@ -316,7 +317,7 @@ class AlgorithmS1:
             psi_epochs=0,
         )
 
-    def prepare(self, transitions: Recording, n_states: int, n_actions: int) -> S1Stream:
+    def prepare(self, transitions: Experience, n_states: int, n_actions: int) -> S1Stream:
         """Validate the stream against the sizes and compute what is the same in every epoch: one pass."""
         if self.implementation == "literal" and not isinstance(transitions, Transitions):
             raise InputError("implementation", "literal", "fast, where the stream is not in memory")

@@ -19,7 +19,7 @@ import torch
 from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.experience.sampling import Sampler
-from erl_torch.experience.simulation import TUPLE_BYTES, Experience, Simulation, fits, tuples_of
+from erl_torch.experience.simulation import TUPLE_BYTES, ReplicaExperience, Simulation, fits, tuples_of
 from erl_torch.experience.transitions import Transitions
 from erl_torch.learners.learner import NonFiniteError
 from erl_torch.learners.s1 import device as s1_torch
@@ -47,7 +47,7 @@ ROWS = 256  # sampled at a time
 NOISY_ROWS = 8192  # of exp(beta r) at a time
 
 
-def can_interleave(replicas: Together, experience: Experience) -> bool:
+def can_interleave(replicas: Together, experience: ReplicaExperience) -> bool:
     """Whether ``replicas`` are published Algorithm S1 with the same loop for all, on streams of one length."""
     learners = replicas.learners
     if not isinstance(learners[0], AlgorithmS1) or learners[0].implementation != "fast":
@@ -122,7 +122,7 @@ class LanesState:
 
 
 def interleave(
-    replicas: Together, experience: Experience, n_states: int, n_actions: int, state: LanesState | None = None
+    replicas: Together, experience: ReplicaExperience, n_states: int, n_actions: int, state: LanesState | None = None
 ) -> Iterator[LanesState]:
     """``Replicas.iterate`` of published Algorithm S1."""
     engine = Engine(replicas, experience, n_states, n_actions)
@@ -161,7 +161,7 @@ class Engine:
     """S1's replicas on one experience: ``init``, ``prepare``, ``step``, as of a single learner."""
 
     replicas: Together
-    experience: Experience
+    experience: ReplicaExperience
     n_states: int
     n_actions: int
 

@@ -1,0 +1,92 @@
+"""``Experience``, the contract of what learners learn from, and what can be done with anything that fulfils it.
+
+``Transitions`` fulfils it in memory, ``erl_torch.experience.recording`` in files of any size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Generic, Protocol, TypeVar, runtime_checkable
+
+import numpy as np
+
+from erl_torch.experience.transitions import Checksum, Transitions, regroup
+
+Part = TypeVar("Part")
+
+
+@runtime_checkable
+class Experience(Protocol):
+    """A stream of tuples (s, a, r, s', a') of any size, in the order in which they are learnt from.
+
+    Every pass over it gives the same tuples. What a learner computes from it does not depend on how it is cut.
+    """
+
+    def __len__(self) -> int:
+        """Number of tuples, >= 1."""
+
+    def check_range(self, n_states: int, n_actions: int) -> None:
+        """Check that all s, s' are below ``n_states`` and all a, a' below ``n_actions``.
+
+        Raises:
+            InputError: a size below 1, or a tuple out of range; it names the first such tuple where it is known.
+        """
+
+    def chunks(self, multiple: int = 1) -> Iterator[Transitions]:
+        """Make one pass: all tuples, in order, some at a time.
+
+        Args:
+            multiple: whole number >= 1; the length of every chunk but the last is a multiple of it.
+
+        Raises:
+            InputError: tuples that can no longer be read, or are no longer those of the first pass.
+        """
+
+    def checksum(self) -> int:
+        """Checksum of all columns, in [0, 2**32), as of ``Checksum``. It does not depend on how the stream is cut."""
+
+
+class Parts(Generic[Part]):
+    """What ``make`` makes of each chunk: once where the stream is in memory, else anew in every pass."""
+
+    def __init__(self, data: Experience, make: Callable[[Transitions], Part], multiple: int = 1) -> None:
+        self._data, self._make, self._multiple = data, make, multiple
+        self._whole = [make(data)] if isinstance(data, Transitions) else []
+
+    @property
+    def whole(self) -> Part:
+        """Of a stream in memory."""
+        return self._whole[0]
+
+    def __iter__(self) -> Iterator[Part]:
+        return iter(self._whole) if self._whole else map(self._make, self._data.chunks(self._multiple))
+
+
+class Selection:
+    """The tuples of an experience for which ``takes_part`` (chunk -> mask [n]) holds: ``n_tuples`` of them, above 0."""
+
+    def __init__(self, data: Experience, takes_part: Callable[[Transitions], np.ndarray], n_tuples: int) -> None:
+        self._data, self._takes_part, self._n = data, takes_part, n_tuples
+
+    def __len__(self) -> int:
+        return self._n
+
+    def check_range(self, n_states: int, n_actions: int) -> None:
+        self._data.check_range(n_states, n_actions)
+
+    def chunks(self, multiple: int = 1) -> Iterator[Transitions]:
+        found = ((chunk, self._takes_part(chunk)) for chunk in self._data.chunks())
+        return regroup((chunk.where(mask) for chunk, mask in found if mask.any()), multiple)
+
+    def checksum(self) -> int:
+        running = Checksum()
+        return [running.of(chunk) for chunk in self.chunks()][-1]
+
+
+def tuple_at(data: Experience, t: int) -> tuple[int, int, float]:
+    """(s, a, r) of tuple ``t``."""
+    for chunk in data.chunks():
+        if t < len(chunk):
+            return int(chunk.s[t]), int(chunk.a[t]), float(chunk.r[t])
+        t -= len(chunk)
+    raise IndexError(t)
