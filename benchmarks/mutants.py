@@ -993,7 +993,7 @@ MUTANTS = [
     Mutant(
         "indices of sparse matrices are trusted",
         "checks.py",
-        "            value.check_format(full_check=True)\n",
+        "            matrix.check_format(full_check=True)\n",
         "            pass\n",
         "test_rounding.py::test_indices_out_of_range_are_named",
     ),

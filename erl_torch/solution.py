@@ -234,6 +234,6 @@ def _single(name: str, found: np.ndarray) -> Any:
 
 
 def _curve(name: str, found: np.ndarray) -> np.ndarray:
-    if found.ndim == 0 or found.dtype.kind not in checks.REAL:
+    if found.ndim == 0 or found.dtype.kind not in checks.REAL_KINDS:
         raise InputError(name, f"array of shape {found.shape} and dtype {found.dtype}", "numbers, one entry an epoch")
     return found
