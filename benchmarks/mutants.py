@@ -1007,7 +1007,7 @@ MUTANTS = [
     Mutant(
         "a correction of rows is not said",
         "mdp/tabular.py",
-        "    if largest > WORTH_A_NOTE:\n",
+        "    if largest > NOTED_CORRECTION:\n",
         "    if largest > 1:\n",
         "test_rounding.py::test_rows_of_single_precision_are_welcome_and_named",
     ),
