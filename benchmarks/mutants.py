@@ -993,7 +993,7 @@ MUTANTS = [
     Mutant(
         "indices of sparse matrices are trusted",
         "checks.py",
-        "            value.check_format(full_check=True)\n",
+        "            matrix.check_format(full_check=True)\n",
         "            pass\n",
         "test_rounding.py::test_indices_out_of_range_are_named",
     ),
@@ -1007,7 +1007,7 @@ MUTANTS = [
     Mutant(
         "a correction of rows is not said",
         "mdp/tabular.py",
-        "    if largest > WORTH_A_NOTE:\n",
+        "    if largest > NOTED_CORRECTION:\n",
         "    if largest > 1:\n",
         "test_rounding.py::test_rows_of_single_precision_are_welcome_and_named",
     ),

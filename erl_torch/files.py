@@ -1,4 +1,4 @@
-"""Files are written to a temporary name and renamed, and read without pickle."""
+"""Write files under a temporary name, then rename them; read them without pickle."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from omegaconf import OmegaConf
 
 from erl_torch.checks import InputError
 
-END_BYTES, MOST_COMMENT = 22, (1 << 16) - 1  # of a zip's last record
-MOST_COUNTED = (1 << 16) - 1  # there: "more than that", or "see the larger record"
+END_BYTES, LONGEST_COMMENT = 22, (1 << 16) - 1  # of a zip's last record
+UNCOUNTED = (1 << 16) - 1  # the count of members there that means "this many or more"
 
 
 def _write(path: str | os.PathLike[str], fill: Callable[[BinaryIO], None]) -> Path:
@@ -67,38 +67,38 @@ def write_json(path: str | os.PathLike[str], value: Mapping[str, Any]) -> Path:
     return write_bytes(path, (json.dumps(value, indent=2, allow_nan=False) + "\n").encode())
 
 
-def read_json(path: str | os.PathLike[str], key: str, otherwise: str) -> dict[str, Any] | None:
+def read_json(path: str | os.PathLike[str], key: str, remedy: str) -> dict[str, Any] | None:
     """A JSON object; None where there is no such file.
 
-    Raises InputError (under ``key``) for a file that holds anything else; ``otherwise`` says what to do about it.
+    Raises InputError (under ``key``) for a file that holds anything else; ``remedy`` tells what to do about it.
     """
     try:
-        found = json.loads(Path(path).read_bytes())
+        value = json.loads(Path(path).read_bytes())
     except FileNotFoundError:
         return None
     except (OSError, ValueError, RecursionError) as error:
-        raise InputError(key, path, f"readable JSON ({error}); {otherwise}") from error
-    if not isinstance(found, dict):
-        raise InputError(key, path, f"a JSON object; {otherwise}")
-    return found
+        raise InputError(key, path, f"readable JSON ({error}); {remedy}") from error
+    if not isinstance(value, dict):
+        raise InputError(key, path, f"a JSON object; {remedy}")
+    return value
 
 
 def began_with(directory: Path, key: str = "overrides") -> list[str] | None:
-    """The arguments that the run in ``directory`` began with; None where they are not noted.
+    """The arguments that the run in ``directory`` began with; None where there is no record of them.
 
-    Raises InputError (under ``key``) for a note that is damaged.
+    Raises InputError (under ``key``) for a record that is damaged.
     """
     path = directory / ".hydra" / "overrides.yaml"
     if not path.exists():
         return None
     try:
-        found: Any = OmegaConf.to_container(OmegaConf.load(path))
-    except Exception as error:  # of the parser, of OmegaConf, of the file system, of text that is none
-        said = " ".join(str(error).split())[:200]
-        raise InputError(key, path, f"a readable list of the arguments that the run began with ({said})") from error
-    if not isinstance(found, list) or not all(isinstance(item, str) for item in found):
+        arguments: Any = OmegaConf.to_container(OmegaConf.load(path))
+    except Exception as error:  # of the parser, of OmegaConf, of the file system, of bytes that are no text
+        reason = " ".join(str(error).split())[:200]
+        raise InputError(key, path, f"a readable list of the arguments that the run began with ({reason})") from error
+    if not isinstance(arguments, list) or not all(isinstance(item, str) for item in arguments):
         raise InputError(key, path, "the list of the arguments that the run began with, key=value each")
-    return found
+    return arguments
 
 
 def write_png(path: str | os.PathLike[str], pixels: np.ndarray) -> Path:
@@ -110,9 +110,9 @@ def write_png(path: str | os.PathLike[str], pixels: np.ndarray) -> Path:
 
 @contextlib.contextmanager
 def alone(directory: str | os.PathLike[str]) -> Iterator[None]:
-    """Hold a run directory: a lock that ends with the process, however that ends, and leaves no file.
+    """Lock a run directory. The lock ends with the process, however that ends, and leaves no file.
 
-    Raises InputError if another process holds it. File systems without locks let everybody in.
+    Raises InputError if another process holds the lock. A file system without locks lets every process in.
     """
     descriptor = os.open(directory, os.O_RDONLY)
     try:
@@ -128,7 +128,7 @@ def alone(directory: str | os.PathLike[str]) -> Iterator[None]:
 
 
 def write_gif(path: str | os.PathLike[str], frames: Sequence[np.ndarray], fps: float) -> Path:
-    """Write pictures [H, W, 3] uint8, ``fps`` a second, over and over; the format goes up to 50."""
+    """Write pictures [H, W, 3] uint8 as an endless loop, ``fps`` pictures per second; the format allows up to 50."""
     from PIL import Image
 
     first, *others = (Image.fromarray(frame) for frame in frames)
@@ -143,40 +143,40 @@ def write_gif(path: str | os.PathLike[str], frames: Sequence[np.ndarray], fps: f
 def read_npz(path: str | os.PathLike[str], key: str = "path") -> dict[str, np.ndarray]:
     """All arrays of an npz file, without pickle.
 
-    Raises InputError (under ``key``) if the file is missing, damaged, or holds objects; it names the damaged member.
+    Raises InputError (under ``key``) if the file is missing, damaged, or holds objects; the message names the member.
     """
     member = ""
     try:
         with zipfile.ZipFile(path) as archive:
             check_directory(archive)
-            found = {}
+            arrays = {}
             for member in archive.namelist():
                 with archive.open(member) as file:
-                    found[member.removesuffix(".npy")] = np.lib.format.read_array(file, allow_pickle=False)
-                    # np.load leaves these unread, and the checksum, which is looked at where a member ends.
+                    arrays[member.removesuffix(".npy")] = np.lib.format.read_array(file, allow_pickle=False)
+                    # np.load does not read to the end of a member, where the checksum is compared.
                     if rest := len(file.read()):
                         raise ValueError(f"{rest} bytes too many")
-            return found
+            return arrays
     except Exception as error:
-        # Damage is answered with a dozen kinds of exception, zlib's and struct's among them.
-        said = f"{member}: {error}" if member else f"{error}"
-        raise InputError(key, path, f"a readable npz file without pickled objects ({said})") from error
+        # Damage raises a dozen kinds of exception, zlib's and struct's among them.
+        reason = f"{member}: {error}" if member else f"{error}"
+        raise InputError(key, path, f"a readable npz file without pickled objects ({reason})") from error
 
 
 def check_directory(archive: zipfile.ZipFile) -> None:
-    """Raise ValueError unless ``archive`` has the members that its last record counts, each array once.
+    """Raise ValueError unless ``archive`` has as many members as its last record counts, and each array once.
 
-    A damaged length in the directory makes one entry swallow those after it, which nothing else tells.
+    A damaged length in the directory makes one entry swallow those after it. No other check notices that.
     """
     file = archive.fp
     assert file is not None
     size = file.seek(0, os.SEEK_END)
-    file.seek(max(0, size - END_BYTES - MOST_COMMENT))
+    file.seek(max(0, size - END_BYTES - LONGEST_COMMENT))
     tail = file.read()
     begin = tail.rfind(b"PK\x05\x06")
     counted = int.from_bytes(tail[begin + 10 : begin + 12], "little")
     names = [name.removesuffix(".npy") for name in archive.namelist()]
-    if counted not in (len(names), MOST_COUNTED):
+    if counted not in (len(names), UNCOUNTED):
         raise ValueError(f"{counted} members are announced, and {len(names)} listed")
     if len(set(names)) < len(names):
         raise ValueError(f"{next(name for name in names if names.count(name) > 1)} is there twice")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import warnings
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 
 class Renamed(NamedTuple):
@@ -16,19 +16,23 @@ class Renamed(NamedTuple):
     instead: str  # what to write today
 
 
-def loader(package: str, home: Mapping[str, str], renamed: Mapping[str, Renamed] | None = None) -> Callable[[str], Any]:
+def loader(
+    package: str, home: Mapping[str, str], renamed: Mapping[str, Renamed] | None = None
+) -> Callable[[str], object]:
     """Make the ``__getattr__`` of ``package``, whose names are in its modules ``home``.
 
     A name in ``renamed`` loads with a DeprecationWarning. Any other name raises AttributeError.
     """
 
-    def load(name: str) -> Any:
+    def load(name: str) -> object:
         old = (renamed or {}).get(name)
         if old is not None:
             warnings.warn(f"{package}.{name} is deprecated: use {old.instead}", DeprecationWarning, stacklevel=2)
-            return getattr(importlib.import_module(f"{package}.{old.module}"), old.name)
+            value: object = getattr(importlib.import_module(f"{package}.{old.module}"), old.name)
+            return value
         if name not in home:
             raise AttributeError(f"module '{package}' has no attribute '{name}'")
-        return getattr(importlib.import_module(f"{package}.{home[name]}"), name)
+        value = getattr(importlib.import_module(f"{package}.{home[name]}"), name)
+        return value
 
     return load

@@ -1,4 +1,4 @@
-"""Standard output and standard error that a run outlives: a reader that goes away, a full disk, a closed descriptor."""
+"""Let a run outlive its standard output and error: a reader that goes away, a full disk, a closed descriptor."""
 
 from __future__ import annotations
 
@@ -6,16 +6,17 @@ import contextlib
 import errno
 import os
 import sys
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TextIO
 
 
 class Lasting:
-    """A text stream whose loss is no error: what cannot be written is dropped, and so is all that follows.
+    """A text stream whose loss is no error: text that cannot be written is dropped, and so is all that follows.
 
-    ``broken`` is the reason, once it is lost. All else is the stream's own.
+    ``broken`` is the reason of the loss, "" before. Any other attribute is that of the wrapped stream.
     """
 
-    def __init__(self, stream: Any) -> None:
+    def __init__(self, stream: TextIO) -> None:
         self._stream, self.broken = stream, ""
 
     def write(self, text: str) -> int:
@@ -25,23 +26,24 @@ class Lasting:
     def flush(self) -> None:
         self._attempt(self._stream.flush)
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> Any:  # of whatever type the wrapped stream's attribute has
         return getattr(self._stream, name)
 
-    def _attempt(self, call: Any) -> None:
+    def _attempt(self, call: Callable[[], object]) -> None:
         try:
             call()
         except BlockingIOError:
-            pass  # a pipe that is full just now: this text is lost, the next may not be
-        except (OSError, RuntimeError, ValueError) as error:  # a signal's handler writes inside a write; it is closed
-            if isinstance(error, OSError):
-                self._lose(error)
+            pass  # the pipe is full just now: this text is lost, the next one may not be
+        except OSError as error:
+            self._lose(error)
+        except (RuntimeError, ValueError):
+            pass  # a signal handler writes during a write, or the stream is closed
 
     def _lose(self, error: OSError) -> None:
         if self.broken:
             return
         self.broken = error.strerror or str(error)
-        with contextlib.suppress(OSError, ValueError):  # what is still in its buffer goes nowhere, at exit too
+        with contextlib.suppress(OSError, ValueError):  # the text that is still in its buffer, at exit too, is dropped
             nowhere = os.open(os.devnull, os.O_WRONLY)
             os.dup2(nowhere, self._stream.fileno())
             os.close(nowhere)
@@ -50,22 +52,22 @@ class Lasting:
 
 
 def lasting() -> None:
-    """Make the process's own output last. Harmless when repeated.
+    """Make the output of this process last. Harmless when repeated.
 
-    Descriptors 0 to 2 that are closed are opened on nothing: the next file would get their number, and the words of
-    whoever writes there.
+    Descriptors 0 to 2 that are closed are opened on the null device. Otherwise the next file would get their number,
+    and with it whatever is written to standard output.
     """
     for descriptor in (0, 1, 2):
         try:
             os.fstat(descriptor)
         except OSError:
-            # The lowest that is free: this one.
+            # The system gives the lowest free number: this one.
             os.open(os.devnull, os.O_RDONLY if descriptor == 0 else os.O_WRONLY)
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
-        if stream is None:  # it was closed when Python started
+        if stream is None:  # closed when Python started
             stream = open(os.devnull, "w")  # noqa: SIM115 (open as long as the process)
         if not isinstance(stream, Lasting):
-            if hasattr(stream, "reconfigure"):  # names that its encoding lacks are shown all the same
+            if hasattr(stream, "reconfigure"):  # characters that its encoding lacks are written as escapes
                 stream.reconfigure(errors="backslashreplace")
             setattr(sys, name, Lasting(stream))

@@ -1,4 +1,4 @@
-"""Pictures as uint8 arrays [height, width, 3], drawn without pyplot and without a display."""
+"""Draw pictures as uint8 arrays [height, width, 3], without pyplot and without a display."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from matplotlib.ticker import EngFormatter
 
 DPI = 100
 MAX_PX = 400  # TensorBoard's image cards are about this wide
-# Okabe and Ito's, told apart with any colour vision, and three more.
+# Those of Okabe and Ito, which any colour vision tells apart, and three more.
 COLOURS = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#222222", "#7b3294", "#8c6d31", "#9a9a9a"]
 MARKERS = "os^"
 
 
 def table_picture(table: np.ndarray, title: str, label: str, max_px: int = MAX_PX) -> np.ndarray:
-    """Any [S, A] table as shades: states down, actions across."""
+    """Any [S, A] table as shades: one row per state, one column per action."""
     figure = Figure(figsize=(max_px / DPI, max_px / DPI), dpi=DPI)
     axes = figure.add_axes((0.13, 0.12, 0.65, 0.8))
     image = axes.imshow(table, aspect="auto", interpolation="nearest", cmap="viridis")
@@ -33,9 +33,9 @@ def table_picture(table: np.ndarray, title: str, label: str, max_px: int = MAX_P
 
 
 def learning_curves(sizes: Sequence[int], curves: Mapping[str, Sequence[Mapping[str, Any]]], title: str) -> np.ndarray:
-    """Gap against tuples of experience, log-log; ``curves`` as ``Comparison.summary`` has them.
+    """Gap against tuples of experience, log-log; ``curves`` as ``Comparison.summary`` gives them.
 
-    Lines are interquartile means, bands their intervals; names stand at the right ends.
+    Lines are interquartile means, bands their intervals; each name stands at the right end of its line.
     """
     figure = Figure(figsize=(8.4, 5.0), dpi=150)
     axes = figure.add_axes((0.095, 0.115, 0.66, 0.77))
@@ -43,17 +43,17 @@ def learning_curves(sizes: Sequence[int], curves: Mapping[str, Sequence[Mapping[
     axes.set_yscale("log")
     ends = []
     for i, (name, points) in enumerate(curves.items()):
-        # A gap of 0 is a policy exact to rounding; a failed seed has no figure.
-        shown = [(n, point) for n, point in zip(sizes, points, strict=True) if point["iqm"]]
-        if not shown:
+        # No logarithm: a gap of 0 (the policy is exact to rounding), or None (a seed failed).
+        drawn = [(n, point) for n, point in zip(sizes, points, strict=True) if point["iqm"]]
+        if not drawn:
             continue
         colour, marker = COLOURS[i % len(COLOURS)], MARKERS[i // len(COLOURS) % len(MARKERS)]
-        x, y = [n for n, _ in shown], [point["iqm"] for _, point in shown]
+        x, y = [n for n, _ in drawn], [point["iqm"] for _, point in drawn]
         axes.plot(x, y, marker, color=colour, linestyle="-", linewidth=1.8, markersize=4, zorder=3, clip_on=False)
-        bands = [(n, *point["interval"]) for n, point in shown if point["interval"]]
+        bands = [(n, *point["interval"]) for n, point in drawn if point["interval"]]
         if bands:
             at, low, high = np.array(bands).T
-            # An interval that reaches 0 has no lower end here: the axis keeps to the lines.
+            # An interval that reaches 0 has no lower end on this axis: it is cut at a third of the lowest point.
             axes.fill_between(at, np.maximum(low, min(y) / 3), high, color=colour, alpha=0.18, linewidth=0, zorder=2)
         ends.append((y[-1], name, colour))
     _plain(axes, "tuples of experience", "gap  g* \u2212 J,  reward a step")
@@ -65,21 +65,21 @@ def learning_curves(sizes: Sequence[int], curves: Mapping[str, Sequence[Mapping[
 
 
 class BandLine(NamedTuple):
-    """A line with its bands for ``bands``."""
+    """One line of ``bands``, with its bands."""
 
     name: str
     x: Sequence[float]
     statistics: Sequence[Mapping[str, float]]  # mean, q25, q75, min, max at each x
-    exact: Sequence[float | None]  # at each x
+    exact: Sequence[float | None]  # at each x; None where it is not known
 
 
 def bands(
     panels: Mapping[str, Sequence[BandLine]], x_label: str, title: str, markers: bool = False, card: bool = False
 ) -> np.ndarray:
-    """Statistics over replicas, a panel for each label: mean, quartiles (shaded), extremes (thin), exact values.
+    """Statistics over replicas, one panel per label: mean, quartiles (shaded), extremes (thin), exact values.
 
-    ``markers``: each x is a setting, and exact values are known there alone: crosses, else a dashed line.
-    ``card``: small enough for a card of TensorBoard's, which takes one panel.
+    ``markers``: each x is a setting; exact values are crosses there. Otherwise they are a dashed line.
+    ``card``: draw it small enough for a card of TensorBoard's; use it with one panel.
     """
     exact: dict[str, Any] = {"linestyle": "", "marker": "x", "markersize": 5} if markers else {"linestyle": "--"}
     caption = f"mean; shaded: quartiles; thin: extremes; {'crosses' if markers else 'dashed'}: exact"
@@ -93,9 +93,9 @@ def bands(
             axes.fill_between(line.x, column["q25"], column["q75"], color=colour, alpha=0.22, linewidth=0, zorder=2)
             for end in ("min", "max"):
                 axes.plot(line.x, column[end], color=colour, linewidth=0.5, alpha=0.8, zorder=2)
-            known = [(x, y) for x, y in zip(line.x, line.exact, strict=True) if y is not None]
-            if known:
-                axes.plot(*zip(*known, strict=True), color="#222222" if len(lines) == 1 else colour,
+            crosses = [(x, y) for x, y in zip(line.x, line.exact, strict=True) if y is not None]
+            if crosses:
+                axes.plot(*zip(*crosses, strict=True), color="#222222" if len(lines) == 1 else colour,
                           linewidth=1.0, zorder=3.5 if markers else 2.5, **exact)  # fmt: skip
         spread = [x for line in lines for x in line.x]
         if markers and min(spread) > 0 and max(spread) / min(spread) >= 20:
@@ -138,7 +138,7 @@ def _plain(axes: Axes, x_label: str, y_label: str) -> None:
 
 
 def _name_ends(axes: Axes, ends: list[tuple[float, str, str]]) -> None:
-    """Names right of the axes at the heights of the curves' ends, moved apart where they would overlap."""
+    """Write names right of the axes, at the heights of the curves' ends, moved apart where they would overlap."""
     if not ends:
         return
     height = axes.transData.transform
@@ -146,7 +146,7 @@ def _name_ends(axes: Axes, ends: list[tuple[float, str, str]]) -> None:
     at = np.array([(height((1, y))[1] - bottom) / (top - bottom) for y, _, _ in ends])
     apart = min(0.05, 1 / len(at))
     room = apart * np.arange(len(at))
-    # Least squares with a least distance: pool neighbours whose wishes cross.
+    # Least squares under a least distance: pool neighbours whose wishes cross.
     pools: list[list[float]] = []
     for wish in at - room:
         pools.append([wish])
@@ -161,7 +161,7 @@ def _name_ends(axes: Axes, ends: list[tuple[float, str, str]]) -> None:
         axes.text(1.045, y, name, color=colour, fontsize=9, weight="bold", va="center", transform=axes.transAxes)
 
 
-# The layouts are fixed: matplotlib's own layout engines take longer than the rest of the picture.
+# All layouts are fixed, because matplotlib's layout engines take longer than the rest of the picture.
 def colour_bar(figure: Figure, shades: ScalarMappable, label: str) -> None:
     width = figure.get_figwidth() * DPI
     bar = figure.colorbar(shades, cax=figure.add_axes((1 - 72 / width, 0.12, 12 / width, 0.76)))

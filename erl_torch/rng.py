@@ -10,7 +10,7 @@ from erl_torch import checks
 
 
 class Streams(NamedTuple):
-    """One generator a purpose, so that more evaluation never changes the experience."""
+    """One generator per purpose, so that more evaluation never changes the experience."""
 
     environment: np.random.Generator
     behaviour: np.random.Generator

@@ -1,4 +1,4 @@
-"""What every learner returns."""
+"""``Solution``: what every learner and solver returns."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Status(enum.Enum):
 
 
 def proven(bounds: tuple[float, float], gap: float | None) -> str:
-    """Bounds on theta* and on a policy's loss as text, rounded away from what they enclose."""
+    """Bounds on theta* and on a policy's loss as text, rounded outwards."""
     low, high = _rounded(bounds[0], 10, ROUND_FLOOR), _rounded(bounds[1], 10, ROUND_CEILING)
     loss = "" if gap is None else f"; objective at most {_rounded(gap, 2, ROUND_CEILING)} below its maximum"
     return f"theta* in [{low}, {high}]{loss}"
@@ -56,7 +56,7 @@ def _rounded(x: float, digits: int, way: str) -> str:
 class Solution:
     """A policy with the tables and the record behind it (symbols as in ``erl_torch.learners.s1.algorithm``).
 
-    ``history`` has one array a logged quantity, one entry an epoch. theta and rho are None where the learner
+    ``history`` has one array per logged quantity, one entry per epoch. theta and rho are None where the learner
     estimates neither (discounted learners); bounds, gap and k where they are not known.
     """
 
@@ -67,7 +67,7 @@ class Solution:
     theta: float | None = None  # reward a step; -theta is the regularised reward rate
     reward_bias: torch.Tensor  # [S, A] >= 0, reward a step
     reward_bias_max: float
-    n_steps: int  # tuples streamed through the u updates
+    n_steps: int  # tuples that the u updates used, all epochs together
     status: Status
     message: str = ""  # where and why, if the run failed
     history: Mapping[str, np.ndarray] = field(default_factory=dict)
@@ -109,6 +109,7 @@ class Solution:
             raise InputError("beta", None, "known: this solution has none, so that u has no unit of reward")
         return self.u.log() / self.beta - total, -self.psi.log() / self.beta - total
 
+    # Any: each field has a type of its own.
     @classmethod
     def of_action_values(
         cls, q: torch.Tensor, prior_policy: torch.Tensor, beta: float, theta: float | None, **others: Any
@@ -140,21 +141,21 @@ class Solution:
         return write_npz(path, self.arrays())
 
     def arrays(self, history: bool = True) -> dict[str, np.ndarray]:
-        """Everything by name, as ``save`` writes it."""
-        found: dict[str, Any] = {}
+        """Every field that is not None by its name, as ``save`` writes it."""
+        values: dict[str, Any] = {}
         for item in fields(self):
             value = getattr(self, item.name)
             if item.name == "history":
-                found |= {f"history/{name}": values for name, values in value.items()} if history else {}
+                values |= {f"history/{name}": curve for name, curve in value.items()} if history else {}
             elif isinstance(value, torch.Tensor):
-                found[item.name] = value.detach().cpu().numpy()
+                values[item.name] = value.detach().cpu().numpy()
             elif value is not None:
-                found[item.name] = value.name if isinstance(value, Status) else value
-        return {name: np.asarray(value) for name, value in found.items()}
+                values[item.name] = value.name if isinstance(value, Status) else value
+        return {name: np.asarray(value) for name, value in values.items()}
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Solution:
-        """Read what ``save`` wrote. Raises InputError naming the file, and what in it is not as ``save`` writes it."""
+        """Read what ``save`` wrote. Raises InputError naming the file, and the array that ``save`` would not write."""
         return cls.of_arrays(read_npz(path), path)
 
     @classmethod
@@ -184,34 +185,34 @@ class Solution:
 
 
 def _readers() -> dict[str, Callable[[str, np.ndarray], Any]]:
-    """What each array of a saved solution becomes."""
+    """By name, the function that turns an array of a saved solution into the field's value."""
 
     def table(*shape: str) -> Callable[[str, np.ndarray], Any]:
-        return lambda name, found: torch.from_numpy(checks.array(name, found, shape, NO_NAN))
+        return lambda name, array: torch.from_numpy(checks.array(name, array, shape, NO_NAN))
 
     def number(fits: Callable[[float], bool], allowed: str) -> Callable[[str, np.ndarray], float]:
-        return lambda name, found: checks.number(name, _single(name, found), fits, allowed)
+        return lambda name, array: checks.number(name, _single(name, array), fits, allowed)
 
-    def count(name: str, found: np.ndarray) -> int:
-        return checks.at_least(name, _single(name, found), 0)
+    def count(name: str, array: np.ndarray) -> int:
+        return checks.at_least(name, _single(name, array), 0)
 
-    def policy(name: str, found: np.ndarray) -> torch.Tensor:
-        kept = checks.array(name, found, ("n_states", "n_actions"), checks.NOT_NEGATIVE)
+    def policy(name: str, array: np.ndarray) -> torch.Tensor:
+        kept = checks.array(name, array, ("n_states", "n_actions"), checks.NOT_NEGATIVE)
         check_policy(name, kept, *kept.shape)
         return torch.from_numpy(kept)
 
-    def status(name: str, found: np.ndarray) -> Status:
-        said = _single(name, found)
-        checks.one_of(name, said, tuple(Status.__members__))
-        return Status[said]
+    def status(name: str, array: np.ndarray) -> Status:
+        value = _single(name, array)
+        checks.one_of(name, value, tuple(Status.__members__))
+        return Status[str(value)]
 
-    def message(name: str, found: np.ndarray) -> str:
-        said = _single(name, found)
-        checks.instance(name, said, str, "text")
-        return str(said)
+    def message(name: str, array: np.ndarray) -> str:
+        value = _single(name, array)
+        checks.instance(name, value, str, "text")
+        return str(value)
 
-    def bounds(name: str, found: np.ndarray) -> tuple[float, float]:
-        low, high = checks.array(name, found, (2,), NO_NAN).tolist()
+    def bounds(name: str, array: np.ndarray) -> tuple[float, float]:
+        low, high = checks.array(name, array, (2,), NO_NAN).tolist()
         if low > high:
             raise InputError(name, (low, high), "in order")
         return low, high
@@ -227,13 +228,14 @@ def _readers() -> dict[str, Callable[[str, np.ndarray], Any]]:
     }  # fmt: skip
 
 
-def _single(name: str, found: np.ndarray) -> Any:
-    if found.ndim:
-        raise InputError(name, f"array of shape {found.shape}", "a single value")
-    return found.item()
+def _single(name: str, array: np.ndarray) -> object:
+    if array.ndim:
+        raise InputError(name, f"array of shape {array.shape}", "a single value")
+    value: object = array.item()
+    return value
 
 
-def _curve(name: str, found: np.ndarray) -> np.ndarray:
-    if found.ndim == 0 or found.dtype.kind not in checks.REAL:
-        raise InputError(name, f"array of shape {found.shape} and dtype {found.dtype}", "numbers, one entry an epoch")
-    return found
+def _curve(name: str, array: np.ndarray) -> np.ndarray:
+    if array.ndim == 0 or array.dtype.kind not in checks.REAL_KINDS:
+        raise InputError(name, f"array of shape {array.shape} and dtype {array.dtype}", "numbers, one entry per epoch")
+    return array

@@ -34,7 +34,7 @@ from erl_torch.learners.efficient_s1 import kernels
 from erl_torch.learners.efficient_s1.algorithm import SWITCHES, certificate, swept
 from erl_torch.learners.s1 import listing
 from erl_torch.solvers.policy import kl_per_state, objective
-from erl_torch.solvers.problem import Problem
+from erl_torch.solvers.problem import BellmanProblem
 
 CLIFF = WindyCliffEnv().mdp
 UNIFORM = np.full((15, 4), 0.25)
@@ -608,7 +608,7 @@ def test_sweeps_never_widen_and_find_the_optimum_of_a_periodic_chain():
     for s in range(6):
         p[s, 0, (s + 1) % 6] = p[s, 1, (s + 3) % 6] = 1.0
     r = -(np.arange(12.0).reshape(6, 2) ** 0.5)
-    problem = Problem.of(erl_torch.TabularMDP(p, r), 3.0)
+    problem = BellmanProblem.of(erl_torch.TabularMDP(p, r), 3.0)
     value, spans = np.zeros(6), []
     for _ in range(60):
         value, gain, made = swept(problem, value, 0.0, 5)

@@ -32,6 +32,8 @@ from erl_torch import (
     solve_biasing,
     solve_soft_bellman,
 )
+from erl_torch.envs.shift import DynamicsShiftEnv
+from erl_torch.learners import LEARNERS
 
 P = np.full((2, 2, 2), 0.5)
 R = np.array([[0.0, 1.0], [2.0, 3.0]])
@@ -257,6 +259,29 @@ def test_numbers_of_numpy_count_as_python_s():
     assert Simulation(MDP, np.int8(100), np.int8(100), [0]).n_tuples == 10_000
     with pytest.raises(InputError, match=r"^clip_rho=1 \(int\): must be True or False"):
         AlgorithmS1(clip_rho=1)
+
+
+FLAGS = [
+    (lambda other: TabularMDP(P, R, normalise=other), "normalise"),
+    (lambda other: Simulation(MDP, 1, 1, [0], keep=other), "keep"),
+    (lambda other: erl_torch.envs.GridWorld(("SG",), cyclic=other), "cyclic"),
+    (lambda other: DynamicsShiftEnv(shifted=other), "shifted"),
+    (lambda other: erl_torch.estimate_mdp("pendulum", cache=other), "cache"),
+    (lambda other: erl_torch.estimate_mdp("pendulum", progress=other), "progress"),
+    *(
+        (lambda other, learner=learner, name=field.name: learner(**{name: other}), field.name)
+        for learner in LEARNERS.values()
+        for field in fields(learner)
+        if field.type == "bool"
+    ),
+]
+
+
+@pytest.mark.parametrize(("call", "key"), FLAGS)
+def test_flags_of_another_kind_are_named(call, key):
+    for other in (0, 1.0, "abc", "True", [True]):
+        with pytest.raises(InputError, match=rf"^{key}=.* \(\w+\): must be True or False$"):
+            call(other)
 
 
 @pytest.mark.parametrize(

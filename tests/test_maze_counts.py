@@ -16,7 +16,7 @@ from erl_torch.reproduction.mazes import MAX_ITERATIONS, count_by_power_iteratio
 from erl_torch.solvers import kernels as solvers_kernels
 from erl_torch.solvers.biasing import iterate_biasing
 from erl_torch.solvers.newton import NewtonPattern
-from erl_torch.solvers.problem import Problem
+from erl_torch.solvers.problem import BellmanProblem
 
 
 def one_maze(size, density, wind_level, seed, i):
@@ -123,7 +123,7 @@ def plain_power(p, weight, beta, tolerance, max_steps):
 @pytest.mark.parametrize(("tolerance", "max_steps"), [(1e-8, 1000), (1e-8, 7), (1e-3, 1000)])
 def test_power_iteration_is_the_plain_one(tolerance, max_steps):
     mdp, beta = one_maze(6, 0.2, 2.0, 0, 0), 3.0
-    problem = Problem.of(mdp, beta)
+    problem = BellmanProblem.of(mdp, beta)
     p, log_weight = problem.transition, beta * problem.reward.ravel()
     chi, steps, converged = reproduction_kernels.capped_power(
         p.indptr, p.indices, p.data, log_weight, beta, tolerance, max_steps

@@ -14,7 +14,7 @@ from erl_torch import InputError, Status, TabularMDP, certify, iterate_biasing, 
 from erl_torch.solvers import soft_bellman
 from erl_torch.solvers.biasing import PATIENCE
 from erl_torch.solvers.newton import NewtonPattern
-from erl_torch.solvers.problem import Problem
+from erl_torch.solvers.problem import BellmanProblem
 from erl_torch.solvers.result import exact_solution
 
 
@@ -32,7 +32,7 @@ def test_the_gap_is_of_the_policy_whatever_proved_the_bounds(seed):
     value = rng.standard_normal(4)
     backed_up, policy = oracle.backup(p, mdp.reward, prior, beta, value)
     bounds = theta - 1e-9, theta + 1e-9
-    found = exact_solution(mdp, Problem.of(mdp, beta, prior), value, Status.STEP_LIMIT, 1, bounds, prior)
+    found = exact_solution(mdp, BellmanProblem.of(mdp, beta, prior), value, Status.STEP_LIMIT, 1, bounds, prior)
     np.testing.assert_allclose(found.policy, policy, rtol=1e-12)
     loss = -theta - oracle.worth(p, mdp.reward, prior, beta, policy)
     assert loss > 1e-3
@@ -88,7 +88,7 @@ def test_the_cut_is_moved_off_a_state_that_is_hardly_ever_met(n, back):
     log_y = np.random.default_rng(n).standard_normal(n)
     mdp = TabularMDP(p[:, None] / p.sum(1)[:, None, None], np.zeros((n, 1)), np.eye(n)[0])
     log_weight = log_y - np.log(dense(mdp)[:, 0] @ np.exp(log_y))
-    found = NewtonPattern.of(Problem.of(mdp, 1.0)).eigenvector(log_weight[:, None], 0, 1e-13, 60)
+    found = NewtonPattern.of(BellmanProblem.of(mdp, 1.0)).eigenvector(log_weight[:, None], 0, 1e-13, 60)
     assert found is not None
     h, (low, high), _ = found
     np.testing.assert_allclose(h - h[0], log_y - log_y[0], atol=1e-11)
@@ -101,7 +101,7 @@ def test_a_tilted_row_is_as_defined():
     """log <exp h>, p exp(h)/<exp h> and its KL to p, also where exp(h) is beyond doubles."""
     rng = np.random.default_rng(0)
     p = rng.dirichlet(np.ones(5), size=(4, 2))
-    problem = Problem.of(TabularMDP(np.concatenate([p, p[:1]]), np.zeros((5, 2))), 1.0)
+    problem = BellmanProblem.of(TabularMDP(np.concatenate([p, p[:1]]), np.zeros((5, 2))), 1.0)
     for h in (rng.standard_normal(5), 1e4 + 300 * rng.standard_normal(5)):
         log_mean, kl, tilted = problem.tilt(h)
         rows = problem.transition.toarray()
@@ -202,7 +202,7 @@ def test_a_gap_is_not_below_the_loss_where_the_difference_rounds_down():
 def test_a_poor_value_does_not_spoil_the_gap_of_its_policy():
     """One action: whatever V is, the policy loses nothing; the gains of V alone would say that it may lose 100."""
     mdp = moving([1, 0], [0.0, 1.0])
-    found = exact_solution(mdp, Problem.of(mdp, 1.0), np.array([0.0, 100.0]), Status.STEP_LIMIT, 1, (-0.5, -0.5))
+    found = exact_solution(mdp, BellmanProblem.of(mdp, 1.0), np.array([0.0, 100.0]), Status.STEP_LIMIT, 1, (-0.5, -0.5))
     assert 0 <= found.gap < 1e-12
 
 
@@ -210,7 +210,7 @@ def test_the_state_with_the_narrowest_bounds_is_kept(monkeypatch):
     """A last step that made the bounds wider does not count, neither in the iteration nor in polishing it."""
     rng = np.random.default_rng(3)
     mdp = random_mdp(rng, 4, 3)
-    problem = Problem.of(mdp, 5.0)
+    problem = BellmanProblem.of(mdp, 5.0)
     good = solve_soft_bellman(mdp, 5.0)
     value = good.value.numpy()
     states = [

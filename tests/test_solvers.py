@@ -30,7 +30,7 @@ from erl_torch.solvers import chains, eigenpair, kernels
 from erl_torch.solvers.chains import RegenerativeLU, SingularChainError, classes, reachable_from
 from erl_torch.solvers.eigenpair import REFUSALS
 from erl_torch.solvers.policy import induced_distribution, kl_per_state, objective, policy_chain, reward_per_step
-from erl_torch.solvers.problem import Problem
+from erl_torch.solvers.problem import BellmanProblem
 
 CLIFF = WindyCliffEnv().mdp
 UNIFORM = np.full((15, 4), 0.25)
@@ -200,7 +200,7 @@ def test_any_value_carries_a_certificate(problem, beta, spread):
     """min(TV - V) <= J(pi_V) <= g* <= max(TV - V), and the gap identity g* - J = E_d KL(pi || pi*)/beta."""
     rng, mdp, prior = problem
     value = spread * rng.standard_normal(mdp.n_states)
-    found = Problem.of(mdp, beta, prior).gains(value)
+    found = BellmanProblem.of(mdp, beta, prior).gains(value)
     policy, (low, high) = found.policy, found.theta_bounds
     q = mdp.reward + (mdp.transition @ value).reshape(mdp.reward.shape)
     weight = prior * np.exp(beta * (q - q.max(1, keepdims=True)))
@@ -513,9 +513,11 @@ def test_bad_arguments(arguments, message):
 
 
 def test_problem_restricts_to_what_the_start_leads_to():
-    problem = Problem.of(two_ends(), 1.0)
+    problem = BellmanProblem.of(two_ends(), 1.0)
     assert problem.n_states == 3
-    assert Problem.of(TabularMDP(two_ends().transition, two_ends().reward, [0, 1, 0]), 1.0).states.tolist() == [1]
+    assert BellmanProblem.of(TabularMDP(two_ends().transition, two_ends().reward, [0, 1, 0]), 1.0).states.tolist() == [
+        1
+    ]
 
 
 @pytest.mark.parametrize("refusals", [1, REFUSALS, REFUSALS + 1])

@@ -27,7 +27,7 @@ from erl_torch.empirical import kernels
 from erl_torch.experience.experience import Experience
 from erl_torch.mdp.tabular import check_prior, normalise_rows
 from erl_torch.solvers.chains import classes
-from erl_torch.solvers.problem import Problem
+from erl_torch.solvers.problem import BellmanProblem
 
 BLOCK = 1 << 16  # tuples at a time: they stay in the processor's cache
 
@@ -74,7 +74,7 @@ class EmpiricalMDP:
         mass = weight.sum(1, keepdims=True)
         reward = np.take_along_axis(self.reward[states], action, axis=1) + np.log(np.minimum(mass, 1.0)) / beta
         start = self.visits[states].sum(1) / self.visits[states].sum()
-        problem = Problem(states, p, reward, weight / mass, start, float(beta))
+        problem = BellmanProblem(states, p, reward, weight / mass, start, float(beta))
         return EmpiricalProblem(problem, used, message, reducible, np.minimum(mass[:, 0], 1.0))
 
     def _part(self) -> tuple[np.ndarray, np.ndarray, str, bool]:
@@ -116,7 +116,7 @@ def _name(inside: np.ndarray) -> str:
 class EmpiricalProblem:
     """The soft Bellman problem that a stream poses."""
 
-    problem: Problem  # on the states that take part
+    problem: BellmanProblem  # on the states that take part
     used: np.ndarray  # [S, A] bool, pairs that take part
     message: str  # what was left out, and why; "" if nothing was
     reducible: bool  # the stream shows several closed classes; this is the most visited

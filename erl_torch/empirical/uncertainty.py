@@ -60,7 +60,7 @@ from erl_torch.solution import Status
 from erl_torch.solvers.certificates import soft_backup
 from erl_torch.solvers.chains import SingularChainError
 from erl_torch.solvers.policy import kl_per_state
-from erl_torch.solvers.problem import Problem
+from erl_torch.solvers.problem import BellmanProblem
 from erl_torch.solvers.soft_bellman import solve_problem
 
 COUNTS = 0.01  # share of the variance from which a pair counts
@@ -315,14 +315,14 @@ class _Worth(NamedTuple):
     value: np.ndarray  # relative, [n]
 
 
-def _worth(problem: Problem, policy: np.ndarray) -> _Worth:
+def _worth(problem: BellmanProblem, policy: np.ndarray) -> _Worth:
     prior = np.where(policy > 0, problem.prior, 1.0)
     lu = problem.regeneration(policy)
     gain, value = lu.poisson((policy * problem.reward).sum(1) - kl_per_state(policy, prior) / problem.beta)
     return _Worth(gain, lu.stationary()[:, None] * policy, value)
 
 
-def _optimum(problem: Problem, near: np.ndarray, tol: float) -> _Worth:
+def _optimum(problem: BellmanProblem, near: np.ndarray, tol: float) -> _Worth:
     """Of the optimal policy, to ``tol`` in J: soft policy iteration from the value ``near`` [n]."""
     last = -np.inf
     for _ in range(MAX_STEPS):

@@ -91,6 +91,8 @@ def estimate_mdp(
     checks.at_least("seed", seed, 0)
     checks.one_of("start", start, STARTS)
     checks.device("device", device)
+    checks.flag("cache", cache)
+    checks.flag("progress", progress)
     if workers is None:
         workers = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     checks.workers("workers", workers)

@@ -96,6 +96,7 @@ class GridWorld:
         for key, reward in given.items():
             if not (checks.is_number(reward) and np.isfinite(reward)):
                 raise InputError(key, reward, "a finite number")
+        checks.flag("cyclic", self.cyclic)
         object.__setattr__(self, "desc", rows)
         object.__setattr__(self, "wind", wind)
         object.__setattr__(self, "action_success_prob", np.broadcast_to(success.astype(np.float64), self.n_actions))

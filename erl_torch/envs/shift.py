@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 from typing import NamedTuple
 
+from erl_torch import checks
 from erl_torch.envs.grid_world import GridWorld, uniform_wind
 from erl_torch.envs.tabular import GridWorldEnv
 
@@ -59,4 +60,5 @@ class DynamicsShiftEnv(GridWorldEnv):
     """
 
     def __init__(self, shifted: bool = False, up_success: float = UP_SUCCESS, render_mode: str | None = None) -> None:
-        super().__init__(getattr(dynamics_shift(up_success), "after" if shifted else "before"), render_mode)
+        grids = dynamics_shift(up_success)
+        super().__init__(grids.after if checks.flag("shifted", shifted) else grids.before, render_mode)

@@ -16,7 +16,7 @@ from erl_torch import checks
 from erl_torch.mdp.tabular import TabularMDP, check_policy
 from erl_torch.solution import Solution, Status
 from erl_torch.solvers.biasing import KL_TOLERANCE, BiasingState, iterate_biasing, solve_biasing
-from erl_torch.solvers.problem import Problem
+from erl_torch.solvers.problem import BellmanProblem
 from erl_torch.solvers.result import bias, ended, reducible_solution, spread
 from erl_torch.solvers.soft_bellman import BellmanState, iterate_soft_bellman, polish, solve_soft_bellman
 
@@ -90,7 +90,7 @@ class Exact:
 
     def iterate(self, mdp: TabularMDP) -> Iterator[ExactState]:
         """Yield each iteration until the bounds are within ``tol``."""
-        problem = Problem.of(mdp, self.beta, self.prior_policy)
+        problem = BellmanProblem.of(mdp, self.beta, self.prior_policy)
         prior = check_policy("prior_policy", self.prior_policy, mdp.n_states, mdp.n_actions)
         ref = problem.regeneration_state()
         if ref is None or (self.method == "biasing" and len(problem.classes[1]) > 1):
@@ -120,7 +120,7 @@ class Exact:
 
     def solution(self, mdp: TabularMDP, state: ExactState, history: list[dict[str, float]], stopped: bool) -> Solution:
         """The solution that ``state`` stands for, with the record of the iterations."""
-        problem = Problem.of(mdp, self.beta, self.prior_policy)
+        problem = BellmanProblem.of(mdp, self.beta, self.prior_policy)
         if not len(state.value):  # no iteration could be made
             return reducible_solution(mdp, problem, self.prior_policy)
         below = [i for i, row in enumerate(history) if row["kl_max"] < KL_TOLERANCE]

@@ -1,1 +1,1 @@
-"""Finite MDPs: tables, and what makes them of Gymnasium's environments."""
+"""Finite MDPs: their tables, and how to read them from Gymnasium's environments."""

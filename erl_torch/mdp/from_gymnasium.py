@@ -1,19 +1,18 @@
-"""What is known of an environment: its sizes and, where it tells, its model as a TabularMDP.
+"""What an environment tells of itself: its sizes and, where it has one, its model as a TabularMDP.
 
-A model is read from ``env.unwrapped.mdp`` (this package's environments) or ``env.unwrapped.P``, the table
+The model is read from ``env.unwrapped.mdp`` (this package's environments) or ``env.unwrapped.P``, the table
 ``P[s][a] = [(probability, s', reward, terminated), ...]`` of Gymnasium's toy_text and many others.
 
-Ends of episodes. The problem solved here is that of an endless process, and P has terminal states, so a reading is
-needed:
+Ends of episodes. The solvers' process is endless, but P has terminal states. There are two readings:
 
-    restart  a step that ends the episode leads straight to the start distribution: long-run averages are those
+    restart  a step that ends the episode leads straight to the start distribution. Long-run averages are then those
              of playing episode after episode. Terminal states are left, but never entered.
-    absorb   it leads to the terminal state s', which is never left: its own rows stand where they stay there
-             (as FrozenLake's), and else become a self-loop with reward 0 (as in CliffWalking and Taxi). The average
+    absorb   it leads to the terminal state s', which is never left. Rows of s' that stay in s' are kept
+             (FrozenLake's do); all others become a self-loop with reward 0 (CliffWalking, Taxi). The average
              reward is then that of the terminal states; where there are several, the solvers call it reducible.
 
-A reward that depends on s' enters as its mean r(s,a): the objective is linear in the reward, so the optimum is the
-same. Entries of P with the same s' are summed. Time limits are no part of a model.
+A reward that depends on s' enters as its mean r(s,a). The objective is linear in the reward, so the optimum is the
+same. Entries of P with the same s' are summed. Time limits are not part of a model.
 """
 
 from __future__ import annotations
@@ -25,6 +24,7 @@ import gymnasium as gym
 import numpy as np
 import scipy.sparse as sp
 from gymnasium import wrappers
+from numpy.typing import ArrayLike
 
 from erl_torch import checks
 from erl_torch.checks import InputError
@@ -44,28 +44,32 @@ NEUTRAL = (
 
 
 class MeanRewardWarning(UserWarning):
-    """Rewards of the environment vary for the same (s, a); the model has their mean."""
+    """Rewards of the environment vary for the same (s,a); the model has their mean."""
 
 
 def sizes(source: TabularMDP | gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]) -> tuple[int, int]:
     """(n_states, n_actions). Raises InputError unless both spaces are Discrete and start at 0."""
     if isinstance(source, TabularMDP):
         return source.n_states, source.n_actions
-    single = "single_" if isinstance(source, gym.vector.VectorEnv) else ""
-    spaces = []
     allowed = "a TabularMDP, or an environment of Gymnasium's"
     checks.instance("source", source, (gym.Env, gym.vector.VectorEnv), allowed)
-    for name in ("observation_space", "action_space"):
-        space = getattr(source, single + name)
-        if not isinstance(space, gym.spaces.Discrete) or space.start != 0:
-            raise InputError(
-                name, space, "Discrete, starting at 0 (a Box can be cut: env.bins, or erl_torch.envs.Discretise)"
-            )
-        spaces.append(int(space.n))
-    return spaces[0], spaces[1]
+    if isinstance(source, gym.vector.VectorEnv):
+        spaces = source.single_observation_space, source.single_action_space
+    else:
+        spaces = source.observation_space, source.action_space
+    return _size("observation_space", spaces[0]), _size("action_space", spaces[1])
 
 
-def known_mdp(source: Any) -> TabularMDP | None:
+def _size(key: str, space: gym.Space[Any]) -> int:
+    if isinstance(space, gym.spaces.Discrete) and space.start == 0:
+        return int(space.n)
+    raise InputError(key, space, "Discrete, starting at 0 (a Box can be cut: env.bins, or erl_torch.envs.Discretise)")
+
+
+# -- questions to an environment that Gymnasium's interface does not answer ---------------------------------
+
+
+def known_mdp(source: object) -> TabularMDP | None:
     """The MDP that ``source`` follows exactly: itself, or that of one of this package's environments."""
     if isinstance(source, TabularMDP):
         return source
@@ -75,16 +79,42 @@ def known_mdp(source: Any) -> TabularMDP | None:
     return mdp if isinstance(mdp, TabularMDP) else None
 
 
-def tabular_mdp(env: gym.Env[Any, Any], on_end: str = "restart", start: Any = None) -> TabularMDP:
+def ending_states(env: gym.Env[Any, Any], n_states: int) -> np.ndarray:
+    """[S] bool: states of this package's environments in which every step ends the episode; none of others."""
+    return np.asarray(getattr(env.unwrapped, "ends", np.zeros(n_states, bool)))
+
+
+def _table(env: gym.Env[Any, Any]) -> Any:  # nothing is promised of it: ``_entries`` checks all that it reads
+    """``P``. Raises InputError where there is none, or where it does not tell of the passenger's moods (Taxi)."""
+    base = env.unwrapped
+    if getattr(base, "fickle_passenger", False):
+        raise InputError("fickle_passenger", True, "False: P does not tell of it (learn from env.step instead)")
+    table = getattr(base, "P", None)
+    if table is None:
+        raise InputError("env", base, "one that has its model as P or mdp (learn from env.step instead)")
+    return table
+
+
+def _own_start(env: gym.Env[Any, Any]) -> ArrayLike | None:
+    """The distribution of the first state, under either of the names that Gymnasium's environments give it."""
+    base = env.unwrapped
+    start: ArrayLike | None = getattr(base, "initial_state_distrib", getattr(base, "isd", None))
+    return start
+
+
+# -- the model ----------------------------------------------------------------------------------------------
+
+
+def tabular_mdp(env: gym.Env[Any, Any], on_end: str = "restart", start: ArrayLike | None = None) -> TabularMDP:
     """The model of an environment that has one; see the module's docstring.
 
     Args:
-        env: with Discrete spaces, and ``P`` or ``mdp``; wrappers that change the process are refused.
+        env: with Discrete spaces, and ``P`` or ``mdp``, without a wrapper that changes the process.
         on_end: "restart" or "absorb".
         start: [S], the start distribution; None is the environment's own.
 
     Raises:
-        InputError: no model, a table that is not as above, or a model that does not tell the whole process.
+        InputError: no model, a table that is not as above, or a model that leaves out part of the process.
 
     Warns:
         MeanRewardWarning: rewards depend on s'.
@@ -94,18 +124,15 @@ def tabular_mdp(env: gym.Env[Any, Any], on_end: str = "restart", start: Any = No
     changed = changed_by(env)
     if changed is not None:
         raise InputError("env", env, f"without {changed}, under which the model is not known")
-    base = env.unwrapped
-    mdp = known_mdp(base)
+    mdp = known_mdp(env)
     if mdp is not None:
-        mdp = TabularMDP(mdp.transition, mdp.reward, mdp.start if start is None else start)
-        ends = np.flatnonzero(getattr(base, "ends", np.zeros(mdp.n_states, bool)))
+        mdp = TabularMDP(mdp.transition, mdp.reward, mdp.start if start is None else start)  # type: ignore[arg-type]
+        ends = np.flatnonzero(ending_states(env, mdp.n_states))
         return mdp if on_end == "restart" else _absorbed(mdp, ends, mdp.reward[ends])
-    if getattr(base, "fickle_passenger", False):
-        raise InputError("fickle_passenger", True, "False: P does not tell of it (learn from env.step instead)")
     n_states, n_actions = sizes(env)
-    row, to, p, r, end = _read(base, n_states, n_actions)
+    row, to, p, r, end = _entries(_table(env), n_states, n_actions)
     n_rows = n_states * n_actions
-    start = _start(base, start, n_states)
+    first = _start(_own_start(env) if start is None else start, n_states)
     mean = np.bincount(row, p * r, n_rows)
     deviation = np.sqrt(np.bincount(row, p * (r - mean[row]) ** 2, n_rows))
     varies = deviation > 1e-9 * max(1.0, np.abs(r).max())
@@ -120,10 +147,10 @@ def tabular_mdp(env: gym.Env[Any, Any], on_end: str = "restart", start: Any = No
     on = sp.coo_array((p[~end], (row[~end], to[~end])), shape=shape)
     if on_end == "restart":
         ending = np.bincount(row[end], p[end], n_rows)
-        transition = on + sp.csr_array(ending[:, None]) @ sp.csr_array(start[None, :])
-        return TabularMDP(transition, mean.reshape(n_states, n_actions), start)
+        transition = on + sp.csr_array(ending[:, None]) @ sp.csr_array(first[None, :])
+        return TabularMDP(transition, mean.reshape(n_states, n_actions), first)
     mdp = TabularMDP(
-        on + sp.coo_array((p[end], (row[end], to[end])), shape=shape), mean.reshape(n_states, n_actions), start
+        on + sp.coo_array((p[end], (row[end], to[end])), shape=shape), mean.reshape(n_states, n_actions), first
     )
     terminal = np.unique(to[end])
     both = np.intersect1d(terminal, to[~end & ~np.isin(row // n_actions, terminal)])
@@ -148,11 +175,8 @@ def changed_by(env: gym.Env[Any, Any]) -> str | None:
     return None
 
 
-def _read(base: Any, n_states: int, n_actions: int) -> tuple[np.ndarray, ...]:
-    """(pair, s', probability, reward, terminated) of every entry of ``base.P``."""
-    table = getattr(base, "P", None)
-    if table is None:
-        raise InputError("env", base, "one that has its model as P or mdp (learn from env.step instead)")
+def _entries(table: Any, n_states: int, n_actions: int) -> tuple[np.ndarray, ...]:  # Any: as ``_table``
+    """(pair, s', probability, reward, terminated) of every entry of ``P``."""
     try:
         entries = [
             (s * n_actions + a, to, p, r, bool(end))
@@ -172,14 +196,12 @@ def _read(base: Any, n_states: int, n_actions: int) -> tuple[np.ndarray, ...]:
     return row, to, p, r, end
 
 
-def _start(base: Any, start: Any, n_states: int) -> np.ndarray:
-    if start is None:
-        start = getattr(base, "initial_state_distrib", getattr(base, "isd", None))
+def _start(start: ArrayLike | None, n_states: int) -> np.ndarray:
     if start is None:
         raise InputError("start", None, "given: the environment does not tell its start distribution")
-    found = checks.array("start", start, (n_states,), checks.NOT_NEGATIVE)
-    normalise_rows(lambda row: "start", np.array([0, n_states]), found, np.inf)
-    return found
+    distribution = checks.array("start", start, (n_states,), checks.NOT_NEGATIVE)
+    normalise_rows(lambda row: "start", np.array([0, n_states]), distribution, np.inf)
+    return distribution
 
 
 def _absorbed(mdp: TabularMDP, states: np.ndarray, reward: np.ndarray) -> TabularMDP:

@@ -1,4 +1,4 @@
-"""Sums of rows without the rounding of their length.
+"""Sums of rows, with an error that does not grow with their length.
 
 Kernels take plain C-contiguous arrays and scalars, use no globals, and validate nothing: the callers do.
 ``error_model="numpy"``: a division by zero gives inf or nan for the caller to find, and no check costs time.

@@ -1,7 +1,7 @@
 """A finite MDP as arrays: transition [S*A, S] sparse, reward [S, A], start [S].
 
-Row ``s * n_actions + a`` of ``transition`` is p(.|s, a). ``reward`` is the expected one-step reward
-(the paper's r(s, a): a function of state and action only). ``start`` is the distribution of the first state.
+Row ``s * n_actions + a`` of ``transition`` is p(.|s, a). ``reward`` is the expected reward of a step
+(the paper's r(s, a), a function of state and action only). ``start`` is the distribution of the first state.
 """
 
 from __future__ import annotations
@@ -10,10 +10,10 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import InitVar, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
+from numpy.typing import ArrayLike
 
 from erl_torch import checks
 from erl_torch.checks import InputError
@@ -21,9 +21,9 @@ from erl_torch.files import read_npz, write_npz
 from erl_torch.mdp import kernels
 from erl_torch.notes import note
 
-ROW_SUM_TOLERANCE = 1e-5  # single precision is welcome
-AS_GIVEN = 1e-15  # rows whose sums are this close to 1 keep their bits
-WORTH_A_NOTE = 1e-9
+ROW_SUM_TOLERANCE = 1e-5  # rows may be given in single precision
+EXACT_SUM = 1e-15  # a row whose sum is this close to 1 keeps its bits
+NOTED_CORRECTION = 1e-9
 SMALLEST_PRIOR = 1e-307
 LARGEST_REWARD = 1e100  # products of such numbers stay in range
 REWARDS = (lambda r: np.abs(r) <= LARGEST_REWARD, f"finite, and at most {LARGEST_REWARD:g} in size")
@@ -35,18 +35,18 @@ class TabularMDP:
     """A validated finite MDP.
 
     Args:
-        transition: p(s'|s, a), [S*A, S] or [S, A, S], as any array of real numbers (lists, numpy, torch), or, [S*A, S],
-            as a sparse one (scipy, torch); repeated entries are summed.
-        reward: [S, A], reward a step.
+        transition: p(s'|s, a), [S*A, S] or [S, A, S], as any array of real numbers (lists, numpy, torch). [S*A, S] may
+            be sparse (scipy, torch); repeated entries are summed.
+        reward: [S, A], reward per step.
         start: [S], distribution of the first state; None is uniform.
-        normalise: divide every row, and start, by its sum, whatever that is.
+        normalise: divide every row, and start, by its sum, even where that is far from 1.
 
-    Rows and start that sum to 1 within 1e-5 are divided by their sums in any case: what is kept, solved and certified
-    are the rows as they stand in ``transition``. A ``Note`` names the largest correction above 1e-9.
+    Rows and start that sum to 1 within 1e-5 are divided by their sums in any case. The rows as they then stand in
+    ``transition`` are those that are kept, solved and certified. A ``Note`` gives the largest correction above 1e-9.
 
     Raises:
-        InputError: no real numbers, wrong shape, an index out of range, a value that is not finite or negative, a row
-            that does not sum to 1 within 1e-5, or to 0 with ``normalise`` (the row is named).
+        InputError: no real numbers, wrong shape, an index out of range, a value that is not finite or is negative, a
+            row that does not sum to 1 within 1e-5, or, with ``normalise``, sums to 0 (the message names the row).
     """
 
     transition: sp.csr_array  # [S*A, S], float64, sorted, no repeated or zero entries
@@ -64,8 +64,8 @@ class TabularMDP:
             start = checks.array("start", self.start, (n_states,), checks.NOT_NEGATIVE)
         tolerance = np.inf if checks.flag("normalise", normalise) else ROW_SUM_TOLERANCE
         rows = normalise_rows(lambda row: _row_name(row, n_actions), transition.indptr, transition.data, tolerance)
-        _say_corrected("rows of transition", rows)
-        _say_corrected("start", normalise_rows(lambda row: "start", np.array([0, n_states]), start, tolerance))
+        _note_correction("rows of transition", rows)
+        _note_correction("start", normalise_rows(lambda row: "start", np.array([0, n_states]), start, tolerance))
         object.__setattr__(self, "transition", transition)
         object.__setattr__(self, "reward", reward)
         object.__setattr__(self, "start", start)
@@ -90,8 +90,8 @@ class TabularMDP:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], normalise: bool = False) -> TabularMDP:
-        """Read what ``save`` wrote, or any npz with ``transition`` (or its CSR parts), ``reward`` and, if not
-        uniform, ``start``; ``normalise`` as in the constructor. Raises InputError naming the file."""
+        """Read what ``save`` wrote, or any npz with ``transition`` (or its CSR parts), ``reward`` and, unless uniform,
+        ``start``; ``normalise`` as in the constructor. Raises InputError naming the file."""
         arrays = read_npz(path)
         parts = [f"transition_{name}" for name in CSR_PARTS]
         if "reward" not in arrays or not ("transition" in arrays or all(part in arrays for part in parts)):
@@ -105,7 +105,7 @@ class TabularMDP:
             raise error.of_file(path) from error
 
 
-def check_policy(key: str, policy: Any, n_states: int, n_actions: int) -> np.ndarray:
+def check_policy(key: str, policy: ArrayLike | None, n_states: int, n_actions: int) -> np.ndarray:
     """``policy`` as a float64 array [S, A] whose rows are distributions; None is the uniform policy.
 
     Raises InputError naming ``key``.
@@ -116,12 +116,12 @@ def check_policy(key: str, policy: Any, n_states: int, n_actions: int) -> np.nda
         return np.full((n_states, n_actions), 1.0 / n_actions)
     table = checks.array(key, policy, (n_states, n_actions), checks.NOT_NEGATIVE)
     rows = np.arange(n_states + 1) * n_actions
-    _say_corrected(f"rows of {key}", normalise_rows(lambda row: f"{key}[{row}]", rows, table.reshape(-1)))
+    _note_correction(f"rows of {key}", normalise_rows(lambda row: f"{key}[{row}]", rows, table.reshape(-1)))
     return table
 
 
-def check_prior(key: str, prior: Any, n_states: int, n_actions: int) -> np.ndarray:
-    """As ``check_policy``, for a prior, which is nowhere 0 (nor below 1e-307, where digits are lost)."""
+def check_prior(key: str, prior: ArrayLike | None, n_states: int, n_actions: int) -> np.ndarray:
+    """As ``check_policy``, for a prior. Every entry must be at least 1e-307: below, digits are lost."""
     table = check_policy(key, prior, n_states, n_actions)
     if not (table >= SMALLEST_PRIOR).all():
         s, a = np.argwhere(table < SMALLEST_PRIOR)[0]
@@ -133,31 +133,31 @@ def check_prior(key: str, prior: Any, n_states: int, n_actions: int) -> np.ndarr
 def normalise_rows(
     name: Callable[[int], str], indptr: np.ndarray, data: np.ndarray, tolerance: float = ROW_SUM_TOLERANCE
 ) -> float:
-    """Divide rows of ``data`` (CSR; finite, >= 0), in place, by their sums; those within 1e-15 of 1 stay as they are.
+    """Divide the rows of ``data`` (CSR; finite, >= 0), in place, by their sums, except sums within 1e-15 of 1.
 
-    Returns the largest distance of a sum from 1. Raises InputError for a row, by its ``name``, whose sum is further
-    than ``tolerance`` from 1, 0 or infinite.
+    Returns the largest distance of a sum from 1. Raises InputError, with the ``name`` of the row, for a sum that is
+    further than ``tolerance`` from 1, or 0, or infinite.
     """
     sums = np.empty(len(indptr) - 1)
     kernels.row_sums(indptr, data, sums)
     off = np.abs(sums - 1)
-    if off.max(initial=0.0) <= AS_GIVEN:  # false for a sum that overflows
+    if off.max(initial=0.0) <= EXACT_SUM:  # false for a sum that overflows
         return 0.0
     bad = np.flatnonzero(~(off <= tolerance) | ~((sums > 0) & np.isfinite(sums)))
     if bad.size:
         allowed = "of a finite sum > 0" if np.isinf(tolerance) else f"1 in sum, within {tolerance:g}"
         raise InputError(name(int(bad[0])), f"sum {sums[bad[0]]:.12g}", allowed)
-    for _ in range(2):  # an entry below double precision's normal numbers may need the second
-        factor = np.where(np.abs(sums - 1) > AS_GIVEN, sums, 1.0)
+    for _ in range(2):  # a subnormal entry may need the second round
+        factor = np.where(np.abs(sums - 1) > EXACT_SUM, sums, 1.0)
         data /= np.repeat(factor, np.diff(indptr))
         kernels.row_sums(indptr, data, sums)
-        if not np.abs(sums - 1).max() > AS_GIVEN:
+        if not np.abs(sums - 1).max() > EXACT_SUM:
             break
     return float(off.max())
 
 
-def _say_corrected(what: str, largest: float) -> None:
-    if largest > WORTH_A_NOTE:
+def _note_correction(what: str, largest: float) -> None:
+    if largest > NOTED_CORRECTION:
         note(f"{what} did not sum to 1, by up to {largest:.1e}: what is kept is divided by the sum")
 
 
@@ -173,13 +173,12 @@ def _csr_of_parts(parts: Sequence[np.ndarray], sizes: tuple[int, ...]) -> sp.csr
     return matrix
 
 
-def _csr(value: Any, n_states: int, n_actions: int) -> sp.csr_array:
+def _csr(value: object, n_states: int, n_actions: int) -> sp.csr_array:
     shape = (n_states * n_actions, n_states)
     more = " ([S*A, S])"
     if not checks.is_sparse(value):
-        value = checks.real("transition", value)
-        if value.shape == (n_states, n_actions, n_states):
-            value = value.reshape(shape)
+        table = checks.real("transition", value)
+        value = table.reshape(shape) if table.shape == (n_states, n_actions, n_states) else table
         more += f" or [{n_states}, {n_actions}, {n_states}] ([S, A, S])"
     more += f", as reward is [{n_states}, {n_actions}] ([S, A]): one of the two is wrong"
     return checks.sparse("transition", value, shape, more)

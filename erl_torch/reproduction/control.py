@@ -19,7 +19,7 @@ from erl_torch.envs.control import control_task
 from erl_torch.experience.rollouts import rollout
 from erl_torch.mdp.tabular import TabularMDP
 from erl_torch.solvers.certificates import soft_backup
-from erl_torch.solvers.problem import Problem
+from erl_torch.solvers.problem import BellmanProblem
 from erl_torch.solvers.result import spread
 
 TASKS = {"pendulum": "Pendulum", "mountain_car": "MountainCar", "cart_pole": "CartPole", "acrobot": "Acrobot"}
@@ -53,7 +53,7 @@ def biasing_by_power(
     max_steps: int = MOST_ITERATIONS,
 ) -> Iterator[PowerState]:
     """Yield every biasing iteration, until KL_TO_STOP or ``max_steps``; V += damping log(y) / beta after each."""
-    problem = Problem.of(mdp, beta)
+    problem = BellmanProblem.of(mdp, beta)
     prior = np.full(mdp.reward.shape, 1.0 / mdp.n_actions)
     value = np.zeros(problem.n_states)
     for _ in range(max_steps):

@@ -11,7 +11,7 @@ from erl_torch.envs.mazes import random_mazes
 from erl_torch.mdp.tabular import TabularMDP
 from erl_torch.reproduction import kernels
 from erl_torch.solvers.biasing import KL_TOLERANCE, solve_biasing
-from erl_torch.solvers.problem import Problem
+from erl_torch.solvers.problem import BellmanProblem
 
 POWER_TOLERANCE = 1e-8  # move of log u / beta and log v / beta in one step
 POWER_STEPS = 1000  # of one eigenvector, at most, in the script that made Table S1
@@ -34,7 +34,7 @@ def count_by_power_iteration(
         power_steps: the cap.
         tolerance: of the last move of log u / beta and log v / beta, reward.
     """
-    problem = Problem.of(mdp, beta)
+    problem = BellmanProblem.of(mdp, beta)
     p, reward = problem.transition, problem.reward.ravel()
     log_psi = np.zeros(problem.n_states)
     n_capped = 0

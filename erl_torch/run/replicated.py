@@ -280,7 +280,7 @@ def _groups(cfg: DictConfig) -> list[Group]:
             raise InputError(f"vary.{key}", values, f"left out: the settings of the learner are {able}")
         if not column or not all(checks.is_number(value) for value in column):
             raise InputError(f"vary.{key}", values, "a list of numbers")
-        if any(abs(value) > checks.MOST for value in column if isinstance(value, int)):
+        if any(abs(value) > checks.LARGEST_INTEGER for value in column if isinstance(value, int)):
             raise InputError(f"vary.{key}", values, "whole numbers below 2**63")
         columns[key] = column
     found = []

@@ -33,7 +33,7 @@ from erl_torch.solvers import kernels
 from erl_torch.solvers.certificates import soft_backup
 from erl_torch.solvers.eigenpair import solve_log_perron
 from erl_torch.solvers.newton import NewtonPattern
-from erl_torch.solvers.problem import Problem
+from erl_torch.solvers.problem import BellmanProblem
 from erl_torch.solvers.result import bias, ended, explain_classes, reducible_solution
 from erl_torch.solvers.soft_bellman import polish
 
@@ -141,7 +141,7 @@ def iterate_biasing(
     return _iterate(problem, ref, known, max_steps)
 
 
-def _iterate(problem: Problem, ref: int, known: Problem | None, max_steps: int) -> Iterator[BiasingState]:
+def _iterate(problem: BellmanProblem, ref: int, known: BellmanProblem | None, max_steps: int) -> Iterator[BiasingState]:
     """``known``: solved for in iteration 0, if it is not ``problem``."""
     beta = problem.beta
     pattern = NewtonPattern.of(problem)
@@ -196,21 +196,21 @@ def _iterate(problem: Problem, ref: int, known: Problem | None, max_steps: int) 
 
 def _problems(
     mdp: TabularMDP, beta: float, prior_policy: Any, target: TabularMDP | None
-) -> tuple[Problem, Problem | None]:
+) -> tuple[BellmanProblem, BellmanProblem | None]:
     """(what is to be solved, what is known of it before, if that is another)."""
-    known = Problem.of(mdp, beta, prior_policy)
+    known = BellmanProblem.of(mdp, beta, prior_policy)
     if target is None:
         return known, None
     checks.instance("target", target, TabularMDP, "a TabularMDP")
     if target.reward.shape != mdp.reward.shape:
         raise InputError("target", f"MDP of shape {target.reward.shape}", f"of the shape of mdp, {mdp.reward.shape}")
-    problem = Problem.of(target, beta, prior_policy)
+    problem = BellmanProblem.of(target, beta, prior_policy)
     if not np.array_equal(problem.states, known.states):
         raise InputError("target", "MDP", "one whose start leads to the same states as that of mdp")
     return problem, known
 
 
-def _no_eigenvector(problem: Problem, known: Problem | None) -> str:
+def _no_eigenvector(problem: BellmanProblem, known: BellmanProblem | None) -> str:
     """Why one of the two has no eigenvector that is positive everywhere; empty where both have."""
     if len(problem.classes[1]) > 1:
         return explain_classes(problem)
@@ -220,7 +220,7 @@ def _no_eigenvector(problem: Problem, known: Problem | None) -> str:
 
 
 def _eigenvector(
-    problem: Problem, value: np.ndarray, pattern: NewtonPattern | None, ref: int
+    problem: BellmanProblem, value: np.ndarray, pattern: NewtonPattern | None, ref: int
 ) -> tuple[np.ndarray, tuple[float, float], Status, int]:
     """Right eigenvector of M_V as its logarithm, with bounds on beta G(V)."""
     log_weight = problem.beta * (problem.action_value(value) - value[:, None])
@@ -238,7 +238,7 @@ def _eigenvector(
     return solve_log_perron(ptr, ind, log_m, start, RTOL, MAX_NEWTON_STEPS, terms, elimination=problem.elimination)
 
 
-def _kl_to(problem: Problem, at: Problem, tilted: np.ndarray) -> np.ndarray:
+def _kl_to(problem: BellmanProblem, at: BellmanProblem, tilted: np.ndarray) -> np.ndarray:
     """KL(optimal dynamics || dynamics of ``problem``), [n*A]; infinite where these lack a transition."""
     p = at.transition
     rows = np.repeat(np.arange(p.shape[0]), np.diff(p.indptr))

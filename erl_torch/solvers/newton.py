@@ -14,7 +14,7 @@ import numpy as np
 from erl_torch.solvers import kernels
 from erl_torch.solvers.chains import EPSILON, Elimination
 from erl_torch.solvers.eigenpair import LOG_POWER_STEPS, POWER_STEPS
-from erl_torch.solvers.problem import Problem
+from erl_torch.solvers.problem import BellmanProblem
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +27,7 @@ class NewtonPattern:
     elimination: Elimination
 
     @classmethod
-    def of(cls, problem: Problem) -> NewtonPattern | None:
+    def of(cls, problem: BellmanProblem) -> NewtonPattern | None:
         """None where the problem is too large or its factors fill too much."""
         if not problem.elimination.fits:
             return None

@@ -1,4 +1,4 @@
-"""The problem as the solvers hold it: an MDP on the states that count, with beta and prior.
+"""``BellmanProblem``, the problem that the solvers solve: an MDP on the states that count, with beta and prior.
 
     TV(s) = (1/beta) log sum_a prior(a|s) exp(beta (r(s,a) + E_{s'|s,a} V(s')))
 
@@ -23,7 +23,7 @@ from erl_torch.solvers.chains import Elimination, RegenerativeLU, SingularChainE
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class BellmanProblem:
     """An MDP on the states that can be reached from its start, with beta and prior."""
 
     states: np.ndarray  # [n] the original states, ascending
@@ -34,7 +34,7 @@ class Problem:
     beta: float
 
     @classmethod
-    def of(cls, mdp: TabularMDP, beta: float, prior_policy: Any = None) -> Problem:
+    def of(cls, mdp: TabularMDP, beta: float, prior_policy: Any = None) -> BellmanProblem:
         """Restrict ``mdp``. Raises InputError for beta <= 0 or a prior that is 0 somewhere."""
         checks.instance("mdp", mdp, TabularMDP, "a TabularMDP")
         beta = checks.temperature("beta", beta)
@@ -131,14 +131,14 @@ class Problem:
         kernels.tilt_rows(p.indptr, p.indices, p.data, h, log_mean, kl, tilted)
         return log_mean, kl, tilted
 
-    def ending(self) -> Problem:
+    def ending(self) -> BellmanProblem:
         """On the one closed class, which the process ends in under policies with full support."""
         label, closed = self.classes
         inside = np.flatnonzero(label == np.flatnonzero(closed)[0])
         rows = (inside[:, None] * self.n_actions + np.arange(self.n_actions)).ravel()
         p = sp.csr_array(self.transition[rows][:, inside])
         start = np.full(len(inside), 1.0 / len(inside))
-        return Problem(self.states[inside], p, self.reward[inside], self.prior[inside], start, self.beta)
+        return BellmanProblem(self.states[inside], p, self.reward[inside], self.prior[inside], start, self.beta)
 
     def regeneration_state(self) -> int | None:
         """A likely start in the only closed class, or None if there are several."""

@@ -10,7 +10,7 @@ import torch
 from erl_torch.mdp.tabular import check_policy
 from erl_torch.solution import Solution, Status
 from erl_torch.solvers.certificates import objective, policy_gains, soft_backup
-from erl_torch.solvers.problem import Problem
+from erl_torch.solvers.problem import BellmanProblem
 
 
 class Sized(Protocol):
@@ -25,7 +25,7 @@ class Sized(Protocol):
 
 def exact_solution(
     mdp: Sized,
-    problem: Problem,
+    problem: BellmanProblem,
     value: np.ndarray,
     status: Status,
     n_steps: int,
@@ -74,14 +74,14 @@ def exact_solution(
     )
 
 
-def bias(problem: Problem, log_psi: np.ndarray) -> np.ndarray:
+def bias(problem: BellmanProblem, log_psi: np.ndarray) -> np.ndarray:
     """delta(s,a) = (log <psi> - <log psi>)/beta of equation (9), [n, A], reward."""
     delta = np.maximum(problem.tilt(log_psi)[0] - problem.transition @ log_psi, 0.0) / problem.beta
     return np.asarray(delta.reshape(problem.reward.shape))
 
 
 def policy_gap(
-    problem: Problem, policy: np.ndarray, bounds: tuple[float, float], value: np.ndarray | None = None
+    problem: BellmanProblem, policy: np.ndarray, bounds: tuple[float, float], value: np.ndarray | None = None
 ) -> float:
     """Upper bound on g* - J(policy) from the start, reward a step, for bounds on theta* = -g*.
 
@@ -96,7 +96,7 @@ def policy_gap(
     return max(float(np.nextafter(-bounds[0] - worth, np.inf)), 0.0)
 
 
-def reducible_solution(mdp: Sized, problem: Problem, prior_policy: Any) -> Solution:
+def reducible_solution(mdp: Sized, problem: BellmanProblem, prior_policy: Any) -> Solution:
     """The best policy and bounds that V = 0 proves, and a message that names the classes."""
     value = np.zeros(problem.n_states)
     bounds = problem.gains(value).theta_bounds
@@ -106,7 +106,7 @@ def reducible_solution(mdp: Sized, problem: Problem, prior_policy: Any) -> Solut
 
 def ended(
     mdp: Sized,
-    problem: Problem,
+    problem: BellmanProblem,
     value: np.ndarray,
     bounds: tuple[float, float],
     tol: float,
@@ -128,7 +128,7 @@ def ended(
     return exact_solution(mdp, problem, value, status, steps, bounds, prior_policy, message, k)
 
 
-def explain_classes(problem: Problem) -> str:
+def explain_classes(problem: BellmanProblem) -> str:
     """Why the states that the start leads to are no single recurrent class, and what to do."""
     label, closed = problem.classes
 
@@ -149,7 +149,7 @@ def explain_classes(problem: Problem) -> str:
     )
 
 
-def spread(problem: Problem, table: np.ndarray, elsewhere: np.ndarray) -> torch.Tensor:
+def spread(problem: BellmanProblem, table: np.ndarray, elsewhere: np.ndarray) -> torch.Tensor:
     """A table on the problem's states as one on all states."""
     full = elsewhere.copy()
     full[problem.states] = table

@@ -26,7 +26,7 @@ from erl_torch.mdp.tabular import TabularMDP, check_policy
 from erl_torch.solution import Solution
 from erl_torch.solvers.certificates import soft_backup
 from erl_torch.solvers.chains import RegenerativeLU, SingularChainError
-from erl_torch.solvers.problem import Problem
+from erl_torch.solvers.problem import BellmanProblem
 from erl_torch.solvers.result import Sized, ended, policy_gap, reducible_solution
 
 FIRST_HORIZON = 300.0  # steps
@@ -75,11 +75,11 @@ def solve_soft_bellman(
     Raises:
         InputError: beta, prior or tol out of range.
     """
-    return solve_problem(Problem.of(mdp, beta, prior_policy), mdp, prior_policy, tol, max_steps)
+    return solve_problem(BellmanProblem.of(mdp, beta, prior_policy), mdp, prior_policy, tol, max_steps)
 
 
 def solve_problem(
-    problem: Problem, mdp: Sized, prior_policy: Any = None, tol: float = 1e-10, max_steps: int = 200
+    problem: BellmanProblem, mdp: Sized, prior_policy: Any = None, tol: float = 1e-10, max_steps: int = 200
 ) -> Solution:
     """As ``solve_soft_bellman``, for a problem on part of the states of ``mdp``, of which only the sizes count."""
     checks.positive("tol", tol)
@@ -108,14 +108,14 @@ def certify(
     """
     for key, one in (("solution", solution), *([] if best is None else [("best", best)])):
         checks.instance(key, one, Solution, "a Solution")
-    problem = Problem.of(mdp, beta, prior_policy)
+    problem = BellmanProblem.of(mdp, beta, prior_policy)
     bounds = (best or solve_soft_bellman(mdp, beta, prior_policy)).theta_bounds
     assert bounds is not None
     policy = check_policy("policy", solution.policy, mdp.n_states, mdp.n_actions)[problem.states]
     return replace(solution, theta_bounds=bounds, gap=policy_gap(problem, policy, bounds), beta=beta)
 
 
-def iterate_soft_bellman(problem: Problem, ref: int, tol: float, max_steps: int) -> Iterator[BellmanState]:
+def iterate_soft_bellman(problem: BellmanProblem, ref: int, tol: float, max_steps: int) -> Iterator[BellmanState]:
     """Yield a state after each Newton step, until its bounds are as narrow as ``tol`` asks or progress ends."""
 
     def done(state: BellmanState) -> bool:
@@ -150,7 +150,7 @@ def iterate_soft_bellman(problem: Problem, ref: int, tol: float, max_steps: int)
 
 
 def polish(
-    problem: Problem, value: np.ndarray, bounds: tuple[float, float], tol: float
+    problem: BellmanProblem, value: np.ndarray, bounds: tuple[float, float], tol: float
 ) -> tuple[np.ndarray, tuple[float, float]]:
     """(value [n], bounds on theta*) after Newton steps from a value whose own rounding keeps ``bounds`` apart."""
     ref = problem.regeneration_state()
@@ -169,7 +169,7 @@ def polish(
 
 
 def _undiscounted(
-    problem: Problem, state: BellmanState, ref: int, done: Callable[[BellmanState], bool], max_steps: int
+    problem: BellmanProblem, state: BellmanState, ref: int, done: Callable[[BellmanState], bool], max_steps: int
 ) -> Iterator[BellmanState]:
     """Newton steps from ``state`` until its bounds are ``done``, or have not halved in three steps."""
     widths = [state.width]
@@ -193,11 +193,11 @@ def _undiscounted(
         yield state
 
 
-def _newton(problem: Problem, state: BellmanState, lu: RegenerativeLU) -> BellmanState:
+def _newton(problem: BellmanProblem, state: BellmanState, lu: RegenerativeLU) -> BellmanState:
     value = state.value + lu.poisson(state.gain)[1]
     return _state(problem, value - value[lu.ref], state.step + 1, np.inf)
 
 
-def _state(problem: Problem, value: np.ndarray, step: int, horizon: float) -> BellmanState:
+def _state(problem: BellmanProblem, value: np.ndarray, step: int, horizon: float) -> BellmanState:
     found = problem.gains(value)
     return BellmanState(step, horizon, value, found.gain, found.policy, found.theta_bounds)

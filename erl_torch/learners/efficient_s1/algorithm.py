@@ -92,7 +92,7 @@ from erl_torch.mdp.tabular import check_prior
 from erl_torch.solution import Solution, Status, proven
 from erl_torch.solvers import kernels as solvers_kernels
 from erl_torch.solvers.certificates import gains, policy_gains, soft_backup
-from erl_torch.solvers.problem import Problem
+from erl_torch.solvers.problem import BellmanProblem
 
 LAST_STEP = 100_000  # visits of a pair in one biasing iteration after which its step stays
 SAFE_RANGE = 180.0  # of logarithms, for plain numbers: products of four such stay in range
@@ -896,7 +896,7 @@ def certificate(part: EmpiricalProblem, log_psi: np.ndarray, policy: np.ndarray)
 
 
 def is_narrow(part: EmpiricalProblem, bounds: tuple[float, float], tol: float, policy: np.ndarray) -> bool:
-    """``Problem.is_narrow`` for a policy [S, A] on all states."""
+    """``BellmanProblem.is_narrow`` for a policy [S, A] on all states."""
     return part.problem.is_narrow(bounds, tol, within(part, policy))
 
 
@@ -906,7 +906,7 @@ def within(part: EmpiricalProblem, policy: np.ndarray) -> np.ndarray:
     return np.asarray(inside / inside.sum(1, keepdims=True))
 
 
-def swept(problem: Problem, value: np.ndarray, goal: float, sweeps: int) -> tuple[np.ndarray, np.ndarray, int]:
+def swept(problem: BellmanProblem, value: np.ndarray, goal: float, sweeps: int) -> tuple[np.ndarray, np.ndarray, int]:
     """(V, TV - V, sweeps made) of relative value iteration from ``value`` [n], until TV - V spans at most ``goal``.
 
     V <- V + DAMPING (TV - V - c). With a step below 1 it converges on periodic chains too, and the span never rises:
