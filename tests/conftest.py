@@ -1,16 +1,14 @@
-"""Shared problems: small random MDPs, exhaustive streams, the authors' data."""
+"""Fixtures of all test files, and Hypothesis' settings."""
 
 import runpy
 import sys
-from pathlib import Path
 
 import hypothesis
 import numpy as np
 import pytest
-from hypothesis import strategies as st
+from helpers import DATA, ROOT
 
-import erl_torch
-from erl_torch import TabularMDP, Transitions
+from erl_torch import Transitions
 
 # First calls compile, so no deadline; the same examples every time.
 hypothesis.settings.register_profile("erl_torch", deadline=None, derandomize=True)
@@ -19,9 +17,6 @@ hypothesis.settings.register_profile(
     "unshrunk", deadline=None, derandomize=True, phases=(hypothesis.Phase.explicit, hypothesis.Phase.generate)
 )
 hypothesis.settings.load_profile("erl_torch")
-
-ROOT = Path(__file__).parents[1]
-DATA = Path(__file__).parent / "data"
 
 
 @pytest.fixture(scope="session")
@@ -52,38 +47,3 @@ def typed_here(tmp_path, monkeypatch, capsys):
         return code, *capsys.readouterr()
 
     return call
-
-
-def random_mdp(rng: np.random.Generator, n_states: int, n_actions: int) -> TabularMDP:
-    """Dense random dynamics (irreducible, aperiodic), rewards in [-1, 0]."""
-    transition = rng.dirichlet(np.full(n_states, 0.5), size=(n_states, n_actions)) + 1e-3
-    transition /= transition.sum(-1, keepdims=True)
-    return TabularMDP(transition, -rng.random((n_states, n_actions)), rng.dirichlet(np.ones(n_states)))
-
-
-def random_policy(rng: np.random.Generator, n_states: int, n_actions: int) -> np.ndarray:
-    return rng.dirichlet(np.full(n_actions, 3.0), size=n_states)
-
-
-def random_stream(rng: np.random.Generator, mdp: TabularMDP, n_tuples: int) -> Transitions:
-    return erl_torch.collect(mdp, 1, n_tuples, int(rng.integers(2**31)))
-
-
-def overshooting(largest_reward):
-    """A stream of 2 states, 1 action, on whose last tuple line 11 leaves rho far above exp(beta largest_reward).
-
-    u(1) has grown by the self-loops of 1, u(0) has not: w/u(0) is large. One tuple pays less, so that the bound is not
-    that of just any reward.
-    """
-    s = np.array([1] * 30 + [0])
-    r = np.full(31, float(largest_reward))
-    r[3] -= 1.0
-    return Transitions(s, 0 * s, r, np.ones(31, int), 0 * s)
-
-
-@st.composite
-def problems(draw):
-    """(generator, MDP, prior policy) of a small random problem."""
-    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
-    n_states, n_actions = draw(st.integers(1, 6)), draw(st.integers(1, 4))
-    return rng, random_mdp(rng, n_states, n_actions), random_policy(rng, n_states, n_actions)

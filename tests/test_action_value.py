@@ -8,7 +8,7 @@ import oracle
 import pytest
 import scipy.sparse as sp
 import torch
-from conftest import problems, random_stream
+from helpers import problems, random_stream
 from hypothesis import strategies as st
 
 from erl_torch import InputError, Status, TabularMDP, Transitions, collect, solve_soft_bellman

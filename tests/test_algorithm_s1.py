@@ -8,7 +8,7 @@ import numpy as np
 import oracle
 import pytest
 import torch
-from conftest import overshooting, problems, random_mdp, random_policy, random_stream
+from helpers import overshooting, problems, random_mdp, random_policy, random_stream
 from hypothesis import strategies as st
 
 from erl_torch import AlgorithmS1, InputError, ListedS1, NonFiniteError, Solution, Status, Transitions, collect

@@ -22,7 +22,14 @@ FLOORS = (
     {"reproduction"},
     {"cli"},
 )
-BESIDE = {("files", "checks"), ("rng", "checks"), ("log", "files"), ("log", "checks"), ("solution", "mdp"), ("problem", "mdp")}
+BESIDE = {
+    ("files", "checks"),
+    ("rng", "checks"),
+    ("log", "files"),
+    ("log", "checks"),
+    ("solution", "mdp"),
+    ("problem", "mdp"),
+}
 # The loop that samples as it learns; one call for each of them would cost a tenth of it.
 ACROSS = {("learners.s1.kernels", "experience.kernels")}
 

@@ -13,10 +13,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import composed, events, undocumented
 from omegaconf import OmegaConf
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.hparams import plugin_data_pb2
-from test_config import composed
 
 from erl_torch import NonFiniteError, solve_soft_bellman
 from erl_torch.envs.windy_cliff import WindyCliffEnv
@@ -25,28 +24,7 @@ from erl_torch.run.report import where
 from erl_torch.run.training import train
 from erl_torch.solvers import certify
 
-PAGE = (Path(__file__).parents[1] / "docs" / "logging.md").read_text()
-DOCUMENTED = set(re.findall(r"`([\w/]+)`", PAGE))
 SMALL = ("experience.n_episodes=20", "learner.n_epochs=2")
-
-
-def events(directory):
-    reader = EventAccumulator(str(directory), size_guidance={"images": 0, "scalars": 0, "tensors": 0})
-    return reader.Reload()
-
-
-def undocumented(directory):
-    """Tags of the run in ``directory`` that docs/logging.md does not have."""
-    found = set()
-    tags = events(directory).Tags()
-    texts = [tag.removesuffix("/text_summary") for tag in tags["tensors"] if tag.endswith("/text_summary")]
-    for tag in [*tags["scalars"], *tags["images"], *texts]:
-        name = re.sub(r"^(bands|sweep)/.*", r"\1/NAME", tag)
-        if name not in DOCUMENTED and not re.match(r"(s1|learner|exact|eval|optimal|prior|data|Final|time)/", tag):
-            name = re.sub(r"^[^/]+/(.*?)_(mean|median|q25|q75|min|max|optimal|prior)$", r"GROUP/\1", tag)
-        if name not in DOCUMENTED:
-            found.add(tag)
-    return found
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ import numpy as np
 import oracle
 import pytest
 import torch
-from conftest import problems, random_stream
+from helpers import problems, random_stream
 from hypothesis import strategies as st
 from scipy.optimize import minimize_scalar
 

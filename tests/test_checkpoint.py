@@ -7,9 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import random_mdp
-from test_config import composed
-from test_training import events
+from helpers import composed, events, random_mdp
 
 from erl_torch import AlgorithmS1, InputError, NonFiniteError, Replicas, Simulation, Solution, Status, collect
 from erl_torch.learners import LEARNERS

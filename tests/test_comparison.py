@@ -1,16 +1,15 @@
 """The comparison of learners: figures against direct evaluation, same bits for any number of processes."""
 
 import json
+from functools import partial
 
 import numpy as np
 import oracle
 import pytest
-from conftest import ROOT, random_mdp, random_policy
-from hydra import compose, initialize_config_dir
+from helpers import composed, random_mdp, random_policy
 from matplotlib.image import imread
 
 from erl_torch import AlgorithmS1, InputError, TabularMDP, collect, pictures, solve_soft_bellman
-from erl_torch.cli import config
 from erl_torch.cli import main as cli
 from erl_torch.learners import LEARNERS, DifferentialSoftQ, SoftQ
 from erl_torch.run.compare import MEASURES, compare, interquartile_mean, iqm_interval, run_comparison
@@ -18,18 +17,13 @@ from erl_torch.solvers.optimum import measure, optimum
 from erl_torch.solvers.policy import objective
 
 SMALL = ("experience.n_episodes=4", "experience.episode_length=500", "seeds=2", "n_sizes=2")
+compared = partial(composed, command="compare")
 PAIR = "learners=[differential_soft_q,soft_q]"
-config.register()
-
-
-def composed(*overrides):
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        return compose("compare", list(overrides))
 
 
 def complaint(directory, *overrides):
     try:
-        run_comparison(composed(*SMALL, *overrides), directory)
+        run_comparison(compared(*SMALL, *overrides), directory)
     except (*cli.BY_CONFIGURATION, *cli.BY_RUN) as error:
         return cli._line(error)
     raise AssertionError(f"{overrides} ran")
@@ -44,7 +38,7 @@ def problem():
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     directory = tmp_path_factory.mktemp("comparison")
-    return directory, run_comparison(composed(*SMALL, PAIR), directory)
+    return directory, run_comparison(compared(*SMALL, PAIR), directory)
 
 
 # -- the measures -----------------------------------------------------------------------------------------
@@ -208,12 +202,10 @@ def test_run_directory(finished):
 
 
 def test_experience_is_that_of_train(finished):
-    from test_config import composed as composed_train
-
     from erl_torch.experience.collect import known_mdp
     from erl_torch.run.build import make_env
 
-    mdp = known_mdp(make_env(composed_train().env))
+    mdp = known_mdp(make_env(composed().env))
     solution = DifferentialSoftQ().fit(collect(mdp, 4, 500, 1), 15, 4)
     expected = measure(mdp, optimum(mdp, 10.0), solution, 10.0)["gap"]
     assert finished[1]["measures"]["gap"]["differential_soft_q"][1][1] == expected
@@ -221,7 +213,7 @@ def test_experience_is_that_of_train(finished):
 
 def test_settings_of_one_learner_and_of_all(tmp_path):
     result = run_comparison(
-        composed(*SMALL, PAIR, "learner.soft_q.n_epochs=2", "beta=3", "n_sizes=1", "seed=5"), tmp_path
+        compared(*SMALL, PAIR, "learner.soft_q.n_epochs=2", "beta=3", "n_sizes=1", "seed=5"), tmp_path
     )
     assert result["beta"] == 3.0
     assert result["seeds"] == [5, 6]
@@ -230,7 +222,7 @@ def test_settings_of_one_learner_and_of_all(tmp_path):
 
 
 def test_every_learner_can_be_compared():
-    cfg = composed()
+    cfg = compared()
     assert set(cfg.learner) == {name for name, learner in LEARNERS.items() if hasattr(learner, "fit")}
     assert set(cfg.learners) <= set(cfg.learner)
 
@@ -260,7 +252,7 @@ def test_complaints(tmp_path, overrides, expected):
 
 
 def test_recorded_experience_is_refused(tmp_path):
-    cfg = composed("experience=recorded", "experience.path=x.npz")
+    cfg = compared("experience=recorded", "experience.path=x.npz")
     with pytest.raises(InputError, match="experience=recorded: must be simulate: every seed needs a stream"):
         run_comparison(cfg, tmp_path)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_dir
+from helpers import CONF, composed
 from omegaconf import OmegaConf
 
 from erl_torch import InputError, checks
@@ -20,14 +20,6 @@ from erl_torch.learners import LEARNERS, AlgorithmS1, ListedS1
 from erl_torch.run import settings as schemas
 from erl_torch.run.build import make_learner
 from erl_torch.run.training import train
-
-CONF = Path(__file__).parents[1] / "conf"
-config.register()
-
-
-def composed(*overrides):
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("train", list(overrides))
 
 
 def complaint(directory, *overrides):

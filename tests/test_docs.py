@@ -2,15 +2,14 @@
 
 import inspect
 import re
-from pathlib import Path
 
 import pytest
+from helpers import ROOT
 
 import erl_torch
 import erl_torch.envs
 import erl_torch.learners
 
-ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
 PUBLIC = {f"erl_torch.{name}": getattr(erl_torch, name) for name in erl_torch.__all__}
 MORE = {

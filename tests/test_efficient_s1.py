@@ -10,7 +10,7 @@ import numpy as np
 import oracle
 import pytest
 import torch
-from conftest import DATA, overshooting, problems, random_mdp, random_policy, random_stream
+from helpers import maze, overshooting, problems, random_mdp, random_policy, random_stream
 from hypothesis import strategies as st
 from scipy.special import logsumexp
 
@@ -252,15 +252,11 @@ def test_noise_in_the_rewards_moves_published_s1_but_not_the_mean():
 
 def test_slow_maze_is_certified():
     """A 10x10 maze under strong wind, where biasing iterations mix slowly."""
-    import scipy.sparse as sp
-
-    with np.load(DATA / "windy_mazes.npz") as d:
-        r = d["m01_R"]
-        rows = sp.csr_array((d["m01_data"], d["m01_indices"], d["m01_indptr"]), shape=(r.size, len(r)))
-        mdp = erl_torch.TabularMDP(rows, r, d["m01_start"])
+    mdp, _ = maze(1)
     data = collect(mdp, 200, 1000, 1)
-    prior = np.full(r.shape, 0.25)
-    found, limit = EfficientS1(5.0).fit(data, *r.shape), CertaintyEquivalence(5.0).fit(data, *r.shape)
+    shape = mdp.reward.shape
+    prior = np.full(shape, 0.25)
+    found, limit = EfficientS1(5.0).fit(data, *shape), CertaintyEquivalence(5.0).fit(data, *shape)
     loss = [-solve_soft_bellman(mdp, 5.0).theta - objective(mdp, f.policy.numpy(), prior, 5.0) for f in (found, limit)]
     assert loss[0] < 1.05 * loss[1]
 

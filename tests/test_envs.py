@@ -6,8 +6,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from conftest import DATA, random_mdp
 from gymnasium.utils.env_checker import check_env
+from helpers import DATA, random_mdp
 from scipy import stats
 
 import erl_torch

@@ -5,7 +5,7 @@ import numpy as np
 import oracle
 import pytest
 import scipy.sparse as sp
-from conftest import random_mdp, random_policy
+from helpers import random_mdp, random_policy
 
 from erl_torch import TabularMDP, evaluate
 from erl_torch.envs.windy_cliff import WindyCliffEnv

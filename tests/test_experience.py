@@ -3,8 +3,8 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from conftest import random_mdp, random_policy
 from gymnasium.vector import AutoresetMode
+from helpers import random_mdp, random_policy
 from scipy import stats
 
 import erl_torch

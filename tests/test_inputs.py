@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 import torch
-from conftest import random_mdp
+from helpers import random_mdp
 
 import erl_torch
 from erl_torch import (

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from test_solvers import kl, maze
+from helpers import kl, maze
 
 from erl_torch import Status, TabularMDP, solve_biasing, solve_soft_bellman
 from erl_torch.envs.mazes import random_mazes

@@ -5,7 +5,7 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
-from conftest import random_mdp
+from helpers import random_mdp
 
 import erl_torch
 from erl_torch import InputError, MeanRewardWarning, TabularMDP, tabular_mdp

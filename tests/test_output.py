@@ -8,8 +8,7 @@ import subprocess
 import sys
 
 import pytest
-from conftest import ROOT
-from test_board import events
+from helpers import ROOT, events
 
 from erl_torch.output import Lasting
 

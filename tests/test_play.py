@@ -5,15 +5,15 @@ import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
+from helpers import ROOT, composed
 from omegaconf import OmegaConf
 from PIL import Image
-from test_config import CONF, composed
 
 from erl_torch import InputError, Solution, TabularMDP
 from erl_torch.cli import main as cli
@@ -23,12 +23,7 @@ from erl_torch.run.playing import find_run, play
 from erl_torch.run.training import train
 from erl_torch.solvers.policy import reward_per_step
 
-ROOT = Path(__file__).parents[1]
-
-
-def arguments(*overrides):
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("play", list(overrides))
+arguments = partial(composed, command="play")
 
 
 def copy(template, run, policy, *overrides):

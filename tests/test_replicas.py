@@ -3,17 +3,14 @@
 import json
 import tracemalloc
 from dataclasses import replace
-from pathlib import Path
 
 import hypothesis
 import numpy as np
 import oracle
 import pytest
 import torch
-from conftest import overshooting, problems, random_mdp, random_policy
+from helpers import composed, events, overshooting, problems, random_mdp, random_policy, undocumented
 from hypothesis import strategies as st
-from test_board import events, undocumented
-from test_config import composed
 
 from erl_torch import (
     AlgorithmS1,
@@ -39,7 +36,6 @@ from erl_torch.rng import streams
 from erl_torch.run.training import train
 from erl_torch.solvers.policy import objective, reward_per_step
 
-ROOT = Path(__file__).parents[1]
 N = 7  # replicas
 SMALL = ("experience.n_episodes=5", "learner.n_epochs=2", "learner.n_bias=3")
 

@@ -6,15 +6,12 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import random_mdp
-from hydra import compose, initialize_config_dir
+from helpers import ROOT, composed, random_mdp
 
 from erl_torch import InputError, estimate_mdp, iterate_biasing
-from erl_torch.cli import config
 from erl_torch.reproduction import ARTIFACTS, SCALES, control, load, runner
 from erl_torch.reproduction.artifact import (
     AGREES,
@@ -34,9 +31,6 @@ from erl_torch.reproduction.artifact import (
     compared_samples,
 )
 from erl_torch.reproduction.figure_3 import moving_average, normalised
-
-ROOT = Path(__file__).parents[1]
-config.register()
 
 
 @pytest.fixture(autouse=True)
@@ -336,11 +330,6 @@ def test_a_bad_name_of_a_unit(small, tmp_path):
 # -- the command ------------------------------------------------------------------------------------------
 
 
-def composed(*overrides):
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        return compose("reproduce", list(overrides))
-
-
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
@@ -354,12 +343,12 @@ def composed(*overrides):
 )
 def test_complaints(tmp_path, overrides, message):
     with pytest.raises(InputError, match=message):
-        runner.reproduce(composed(*overrides), tmp_path)
+        runner.reproduce(composed(*overrides, command="reproduce"), tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_command(tmp_path, capsys):
-    (output,) = runner.reproduce(composed("artifact=figure_4", "processes=1"), tmp_path).values()
+    (output,) = runner.reproduce(composed("artifact=figure_4", "processes=1", command="reproduce"), tmp_path).values()
     assert isinstance(output, Output)
     assert isinstance(output.comparisons[0], Comparison)
     said = capsys.readouterr().out

@@ -8,8 +8,7 @@ import warnings
 import numpy as np
 import oracle
 import pytest
-from conftest import random_mdp, random_policy
-from test_config import composed
+from helpers import composed, random_mdp, random_policy
 
 import erl_torch
 from erl_torch import NonFiniteError, TabularMDP, Transitions, collect

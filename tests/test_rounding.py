@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 import torch
-from conftest import random_mdp, random_policy
+from helpers import random_mdp, random_policy
 from mpmath import mp, mpf
 
 from erl_torch import (

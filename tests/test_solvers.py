@@ -9,7 +9,7 @@ import oracle
 import pytest
 import scipy.sparse as sp
 import torch
-from conftest import DATA, problems, random_mdp, random_policy
+from helpers import kl, maze, problems, random_mdp, random_policy
 from hypothesis import strategies as st
 
 import erl_torch
@@ -35,19 +35,6 @@ from erl_torch.solvers.problem import BellmanProblem
 CLIFF = WindyCliffEnv().mdp
 UNIFORM = np.full((15, 4), 0.25)
 BETAS = (1e-3, 0.1, 1.0, 10.0, 100.0, 1e3, 1e4)
-
-
-def maze(i):
-    with np.load(DATA / "windy_mazes.npz") as data:
-        r = data[f"m{i:02d}_R"]
-        csr = (data[f"m{i:02d}_data"], data[f"m{i:02d}_indices"], data[f"m{i:02d}_indptr"])
-        p = sp.csr_array(csr, shape=(r.size, len(r)))
-        known = {name: data[f"m{i:02d}_{name}"] for name in ("theta", "policy", "k", "beta")}
-        return TabularMDP(p, r, data[f"m{i:02d}_start"]), known
-
-
-def kl(policy, other):
-    return float(kl_per_state(np.asarray(policy), np.asarray(other)).max())
 
 
 # -- three routes -------------------------------------------------------------------------------------------

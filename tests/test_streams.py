@@ -12,8 +12,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from conftest import random_mdp
-from test_config import composed
+from helpers import composed, random_mdp
 
 from erl_torch import (
     AlgorithmS1,

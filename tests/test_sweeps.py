@@ -10,11 +10,10 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from conftest import ROOT
+from helpers import ROOT, composed
 from hydra.core.config_store import ConfigStore
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
-from test_config import composed
 
 from erl_torch import InputError
 from erl_torch.cli import main as cli

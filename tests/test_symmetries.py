@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import random_mdp, random_policy
+from helpers import random_mdp, random_policy
 from scipy.special import logsumexp
 
 from erl_torch import CertaintyEquivalence, EfficientS1, Transitions, collect

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import random_policy
+from helpers import random_policy
 from oracle import stationary
 
 RNG_SEEDS = range(12)

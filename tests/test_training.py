@@ -14,10 +14,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from conftest import ROOT, random_mdp
+from helpers import ROOT, composed, events, random_mdp, undocumented
 from omegaconf import OmegaConf
-from test_board import events, undocumented
-from test_config import composed
 
 from erl_torch import InputError, Solution, Status, Transitions, evaluate
 from erl_torch.cli import main as cli

@@ -5,6 +5,7 @@ import zipfile
 import numpy as np
 import pytest
 import torch
+from helpers import DATA
 
 from erl_torch import InputError, Transitions, open_recording
 
@@ -34,8 +35,6 @@ def test_round_trip_is_exact_and_repeatable(tmp_path):
 
 
 def test_loads_any_npz_with_the_columns(authors, authors_tuples):
-    from conftest import DATA
-
     loaded = Transitions.load(DATA / "windy_cliff_s1.npz")
     assert np.array_equal(loaded.s_next, authors_tuples.s_next)
     assert len(loaded) == 20_000

@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from conftest import random_mdp, random_stream
+from helpers import random_mdp, random_stream
 from scipy.optimize import brentq
 
 from erl_torch import (
