@@ -930,8 +930,8 @@ MUTANTS = [
     Mutant(
         "a gain's error has no rounding of the logarithm",
         "solvers/certificate_kernels.py",
-        "    return found, rounding\n",
-        "    return found, 0.0\n",
+        "    return maximum, rounding\n",
+        "    return maximum, 0.0\n",
         "test_rounding.py::test_gains_lie_between_their_ends",
     ),
     Mutant(
@@ -958,7 +958,7 @@ MUTANTS = [
     Mutant(
         "divergence without its lower end",
         "solvers/certificate_kernels.py",
-        "    rounding = (n + 40) * epsilon * found + 8.0 * epsilon * size + n * 1e-322",
+        "    rounding = (n + 40) * epsilon * kl + 8.0 * epsilon * size + n * 1e-322",
         "    rounding = 0.0",
         "test_rounding.py::test_policy_gains_lie_between_their_ends",
     ),
@@ -979,7 +979,7 @@ MUTANTS = [
     Mutant(
         "the probability of ending in a class is left out",
         "solvers/chains.py",
-        "share[inside] = mass * part.of_state",
+        "share[members] = mass * own.of_state",
         "share[inside] = part.of_state / len(ends)",
         "test_rounding.py::test_endings_of_a_chain_with_several_classes",
     ),
@@ -1035,8 +1035,8 @@ MUTANTS = [
     Mutant(
         "biasing has the bounds of its last value",
         "solvers/biasing.py",
-        "        lower, upper = max(lower, proven.theta_bounds[0]), min(upper, proven.theta_bounds[1])\n",
-        "        lower, upper = proven.theta_bounds\n",
+        "        lower, upper = max(lower, gains.theta_bounds[0]), min(upper, gains.theta_bounds[1])\n",
+        "        lower, upper = gains.theta_bounds\n",
         "test_solver_claims.py::test_bounds_of_biasing_iterations_are_the_best_so_far",
     ),
     Mutant(
@@ -1077,21 +1077,21 @@ MUTANTS = [
     Mutant(
         "STOPPED whatever the bounds",
         "solvers/biasing.py",
-        "        if found.status is not Status.CONVERGED:\n",
+        "        if solution.status is not Status.CONVERGED:\n",
         "        if True:\n",
         "test_solver_claims.py::test_at_the_first_iteration_with_small_kl_the_bounds_say_whether_it_has_converged",
     ),
     Mutant(
         "a target on other states passes",
         "solvers/biasing.py",
-        "    if not np.array_equal(problem.states, known.states):\n",
+        "    if not np.array_equal(problem.states, source.states):\n",
         "    if False:\n",
         "test_solver_claims.py::test_a_target_on_other_states_is_refused",
     ),
     Mutant(
         "the model known before may fall apart",
         "solvers/biasing.py",
-        "    if known is not None and len(known.classes[1]) > 1:\n",
+        "    if source is not None and len(source.classes[1]) > 1:\n",
         "    if False:\n",
         "test_solver_claims.py::test_the_model_known_before_needs_one_class_as_the_target_does",
     ),
@@ -1495,8 +1495,8 @@ MUTANTS = [
     Mutant(
         "KL of a comparison the other way round",
         "solvers/optimum.py",
-        "kl = kl_per_state(best.policy, policy)",
-        "kl = kl_per_state(policy, best.policy)",
+        "kl = kl_per_state(optimum.policy, policy)",
+        "kl = kl_per_state(policy, optimum.policy)",
         "test_comparison.py::test_measures_are_their_definitions",
     ),
     Mutant(
@@ -1588,8 +1588,8 @@ MUTANTS = [
     Mutant(
         "a quarter of the error of a sum of divergences",
         "solvers/certificate_kernels.py",
-        "rounding = (n + 40) * epsilon * found",
-        "rounding = (0.25 * n + 10) * epsilon * found",
+        "rounding = (n + 40) * epsilon * kl",
+        "rounding = (0.25 * n + 10) * epsilon * kl",
         "test_rounding.py::test_rounding_of_a_sum_of_divergences_is_in_the_bounds",
     ),
     Mutant(

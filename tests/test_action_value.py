@@ -17,7 +17,7 @@ from erl_torch.learners import LEARNERS, DifferentialSoftQ, QLearning, RVISoftQ,
 from erl_torch.learners.action_value import kernels as action_value_kernels
 from erl_torch.solvers import kernels as solvers_kernels
 from erl_torch.solvers.chains import RegenerativeLU
-from erl_torch.solvers.optimum import measure, optimum
+from erl_torch.solvers.optimum import measure, solve_optimum
 
 AVERAGE = (DifferentialSoftQ, RVISoftQ)
 OPTIMISTIC = (ULearning, ZLearning)
@@ -258,7 +258,7 @@ def test_any_beta_on_the_cliff(cliff, learner_class, beta):
     assert torch.isfinite(found.action_value).all()
     if found.theta is not None:
         assert 0.0 < found.theta < 5.0  # the rewards lie in [-5, 0]
-    measured = measure(mdp, optimum(mdp, beta), found, beta)
+    measured = measure(mdp, solve_optimum(mdp, beta), found, beta)
     assert 0.0 <= measured["gap"] < 6.0
     assert math.isnan(measured["theta_error"]) == (found.theta is None)
 
@@ -266,7 +266,7 @@ def test_any_beta_on_the_cliff(cliff, learner_class, beta):
 def test_one_pass_of_differential_soft_q_on_the_cliff(cliff):
     """500,000 tuples, step n**-0.6: measured gap 1e-4, where Algorithm S1 as published has 2e-3."""
     mdp, _ = cliff
-    best = optimum(mdp, 10.0)
+    best = solve_optimum(mdp, 10.0)
     data = collect(mdp, 500, 1000, seed=1)
     gap = {
         c: measure(mdp, best, c(n_epochs=1).fit(data, 15, 4), 10.0)["gap"]

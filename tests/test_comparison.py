@@ -13,7 +13,7 @@ from erl_torch import AlgorithmS1, InputError, TabularMDP, collect, pictures, so
 from erl_torch.cli import main as cli
 from erl_torch.learners import LEARNERS, DifferentialSoftQ, SoftQ
 from erl_torch.run.compare import MEASURES, compare, interquartile_mean, iqm_interval, run_comparison
-from erl_torch.solvers.optimum import measure, optimum
+from erl_torch.solvers.optimum import measure, solve_optimum
 from erl_torch.solvers.policy import objective
 
 SMALL = ("experience.n_episodes=4", "experience.episode_length=500", "seeds=2", "n_sizes=2")
@@ -51,7 +51,7 @@ def test_measures_are_their_definitions(problem, beta):
     best = oracle.biasing_iterations(p, mdp.reward, prior, beta, 25)[-1]
     solution = DifferentialSoftQ(beta=beta, n_epochs=1, prior_policy=prior).fit(collect(mdp, 1, 400, 3), 5, 3)
     policy = solution.policy.numpy()
-    found = measure(mdp, optimum(mdp, beta, prior), solution, beta)
+    found = measure(mdp, solve_optimum(mdp, beta, prior), solution, beta)
     assert found["gap"] == pytest.approx(-best.theta - oracle.worth(p, mdp.reward, prior, beta, policy), abs=1e-10)
     kl = (best.policy * np.log(best.policy / policy)).sum(1)
     share = oracle.stationary(np.einsum("sa,sat->st", best.policy, p))
@@ -59,14 +59,14 @@ def test_measures_are_their_definitions(problem, beta):
     assert found["kl_states"] == pytest.approx(kl.mean(), rel=1e-8)
     assert found["theta_error"] == pytest.approx(abs(solution.theta - best.theta), abs=1e-9)
     assert found["n_steps"] == 400
-    exact = measure(mdp, optimum(mdp, beta, prior), solve_soft_bellman(mdp, beta, prior), beta)
+    exact = measure(mdp, solve_optimum(mdp, beta, prior), solve_soft_bellman(mdp, beta, prior), beta)
     assert max(exact[name] for name in ("gap", "kl", "kl_states", "theta_error")) < 1e-14
 
 
 def test_gap_is_finite_where_the_optimal_policy_underflows():
     mdp = TabularMDP([[[0.5, 0.5]] * 2] * 2, [[0.0, -1.0], [-2.0, 0.0]])
     solution = SoftQ(beta=1.0, n_epochs=1).fit(collect(mdp, 1, 100), 2, 2)
-    best = optimum(mdp, 2000.0)
+    best = solve_optimum(mdp, 2000.0)
     assert best.policy.min() == 0.0
     found = measure(mdp, best, solution, 2000.0)
     expected = -best.theta - objective(mdp, solution.policy.numpy(), np.full((2, 2), 0.5), 2000.0)
@@ -120,7 +120,7 @@ def test_every_learner_has_the_same_experience(problem):
     assert found.sizes == (1000, 2000)
     assert found.seeds == (3, 8)
     assert seen == [(1, 4), (2, 4), (3, 4), (4, 4)]
-    best = optimum(mdp, 2.0, prior)
+    best = solve_optimum(mdp, 2.0, prior)
     for i, learner in enumerate(learners(prior).values()):
         for j, seed in enumerate(found.seeds):
             data = collect(mdp, 4, 500, seed, behaviour, prior)
@@ -207,7 +207,7 @@ def test_experience_is_that_of_train(finished):
 
     mdp = known_mdp(make_env(composed().env))
     solution = DifferentialSoftQ().fit(collect(mdp, 4, 500, 1), 15, 4)
-    expected = measure(mdp, optimum(mdp, 10.0), solution, 10.0)["gap"]
+    expected = measure(mdp, solve_optimum(mdp, 10.0), solution, 10.0)["gap"]
     assert finished[1]["measures"]["gap"]["differential_soft_q"][1][1] == expected
 
 

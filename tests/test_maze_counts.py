@@ -38,7 +38,7 @@ def one_maze(size, density, wind_level, seed, i):
 def test_compiled_eigenvectors_are_the_general_ones(cell, beta, monkeypatch):
     mdp = one_maze(*cell)
     compiled = solve_biasing(mdp, beta, stop="kl")
-    monkeypatch.setattr("erl_torch.solvers.chains.SPARSE_STATES", 0)
+    monkeypatch.setattr("erl_torch.solvers.chains.ORDERED_STATES", 0)
     general = solve_biasing(mdp, beta, stop="kl")
     assert compiled.k == general.k
     assert compiled.theta == pytest.approx(general.theta, abs=1e-12)

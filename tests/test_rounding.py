@@ -307,7 +307,7 @@ def test_indices_out_of_range_are_named(layout):
 
 
 def test_states_that_are_never_left_do_not_reach_superlu(monkeypatch):
-    monkeypatch.setattr("erl_torch.solvers.chains.SPARSE_STATES", 0)
+    monkeypatch.setattr("erl_torch.solvers.chains.ORDERED_STATES", 0)
     chain = sp.csr_array(np.array([[0.5, 0.5, 0.0], [0.0, 1.0, 0.0], [0.5, 0.0, 0.5]]))
     with pytest.raises(SingularChainError, match="state 1 is never left"):
         RegenerativeLU(chain, 0)

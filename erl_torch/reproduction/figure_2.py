@@ -21,7 +21,7 @@ from erl_torch.reproduction.artifact import (
     Results,
     Units,
 )
-from erl_torch.solvers.optimum import optimum
+from erl_torch.solvers.optimum import solve_optimum
 from erl_torch.solvers.policy import induced_distribution, kl_per_state
 
 SIZE, TRAPS, WIND_LEVEL, BETA = 10, 10, 2.0, 30.0
@@ -38,7 +38,7 @@ def units(scale: str, seed: int) -> Units:
 
 def work(maze_seed: int) -> dict[str, Any]:
     mdp = random_maze(SIZE, TRAPS, wind_level=WIND_LEVEL, seed=maze_seed).mdp()
-    best = optimum(mdp, BETA)  # soft policy iteration
+    best = solve_optimum(mdp, BETA)  # soft policy iteration
     kl, policy = [], best.policy
     for state in iterate_biasing(mdp, BETA, max_steps=ITERATIONS):
         # All states of a maze can be reached from its start.

@@ -23,7 +23,7 @@ from erl_torch.reproduction.artifact import (
     compared,
     compared_samples,
 )
-from erl_torch.solvers.optimum import measure, optimum
+from erl_torch.solvers.optimum import measure, solve_optimum
 from erl_torch.solvers.policy import objective, reward_per_step
 
 BETA, HORIZON = 10.0, 1000
@@ -64,7 +64,7 @@ def work(
     ``reward`` and ``objective`` are [n_bias, n_epochs] of S1's policies; ``efficient_*`` [passes].
     """
     mdp = WindyCliffEnv().mdp
-    best = optimum(mdp, beta)
+    best = solve_optimum(mdp, beta)
     prior = np.full_like(mdp.reward, 1 / mdp.n_actions)
     data = collect(mdp, n_episodes, episode_length, seed)
     sizes = mdp.n_states, mdp.n_actions
@@ -104,7 +104,7 @@ def work(
 def references() -> dict[str, Any]:
     """Exact values: optimum, prior, and the policies of exact biasing iterations."""
     mdp = WindyCliffEnv().mdp
-    best = optimum(mdp, BETA)
+    best = solve_optimum(mdp, BETA)
     prior = np.full_like(mdp.reward, 1 / mdp.n_actions)
     states = list(iterate_biasing(mdp, BETA, max_steps=N_BIAS + 2))
     end = states[-1].value

@@ -44,7 +44,7 @@ from erl_torch.notes import collected
 from erl_torch.run.build import make_env, make_learner, make_world
 from erl_torch.run.settings import check_comparison_keys
 from erl_torch.solution import Status
-from erl_torch.solvers.optimum import Optimum, measure, optimum
+from erl_torch.solvers.optimum import Optimum, measure, solve_optimum
 
 MEASURES = ("gap", "kl", "kl_states", "theta_error", "n_steps", "seconds")
 LEVEL = 0.95  # of the intervals
@@ -160,7 +160,7 @@ def compare(
         its = check_policy(f"{name}: prior_policy", learner.prior_policy, mdp.n_states, mdp.n_actions)
         if not np.allclose(its, prior, rtol=0, atol=1e-12):
             raise InputError(f"{name}: prior_policy", "array", "the prior of the comparison: one objective for all")
-    best = optimum(mdp, beta, prior)
+    best = solve_optimum(mdp, beta, prior)
     sizes = _sizes(n_episodes * episode_length, n_sizes)
     experience = (mdp, n_episodes, episode_length)
     jobs = {

@@ -1,4 +1,4 @@
-"""Exact solvers of a finite MDP, each answer with a proof of how good it is."""
+"""Exact solvers of a finite MDP; each solution carries proven bounds on its error."""
 
 from __future__ import annotations
 

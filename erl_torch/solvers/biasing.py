@@ -1,6 +1,6 @@
 """Biasing iterations: the paper's Algorithm 1, exact.
 
-With psi = exp(-beta V), one iteration finds the dominant right eigenvector y of
+With psi = exp(-beta V), one iteration computes the dominant right eigenvector y of
 
     M_V(s, s') = sum_a prior(a|s) exp(beta (r(s,a) + E V - V(s))) p(s'|s,a)
 
@@ -8,22 +8,22 @@ With psi = exp(-beta V), one iteration finds the dominant right eigenvector y of
 from one iteration to the next, G(V) >= -theta*, and near the solution the error squares. In the iteration's own
 optimal dynamics the transition probabilities are p(s'|s,a) y(s') / <y>: once they are p, V solves the problem.
 
-Iteration 0 has V = 0, no bias: its policy is the optimistic one. Counting: ``k`` is the 0-based index of the first
-iteration with KL(optimal dynamics || p) < 1e-6 in every (s,a), which is the number of bias updates (Table S1;
-Table S2 counts eigen-solves, k + 1).
+Iteration 0 has V = 0, that is no bias: its policy is the optimistic one. ``k`` is the 0-based index of the first
+iteration with KL(optimal dynamics || p) < 1e-6 in every (s,a). That is the number of bias updates, as Table S1 counts;
+Table S2 counts eigen-solves, k + 1.
 
 Another target (equations 23-25 of the paper). If the dynamics known before, ``mdp.transition``, are not those to be
-solved for, the biased dynamics are p b ~ target psi: the old dynamics cancel, and enter iteration 0 alone, which is
-solved as the old problem and so hands its value over as the start.
+solved for, the biased dynamics are p b ~ target psi. The old dynamics cancel: they enter iteration 0 alone, which
+solves the old problem, and whose value is the start of the new one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from erl_torch import checks
 from erl_torch.checks import InputError
@@ -62,7 +62,7 @@ class BiasingState:
 def solve_biasing(
     mdp: TabularMDP,
     beta: float,
-    prior_policy: Any = None,
+    prior_policy: ArrayLike | None = None,
     target: TabularMDP | None = None,
     tol: float = 1e-10,
     max_steps: int = 200,
@@ -71,32 +71,32 @@ def solve_biasing(
     """Algorithm 1 with certificates.
 
     Args:
-        mdp: the problem; with ``target``, what is known of it before.
+        mdp: the problem; with ``target``, the model known before.
         beta, prior_policy: as in ``solve_soft_bellman``.
-        target: the MDP to be solved, if it is not ``mdp`` itself: same shapes, its dynamics and rewards count.
-        tol: width of the bounds on theta* to stop at, as in ``solve_soft_bellman``.
+        target: the MDP to be solved, if it is not ``mdp`` itself; of the same shape.
+        tol: width of the bounds on theta* at which to stop, as in ``solve_soft_bellman``.
         max_steps: biasing iterations at most.
         stop: "certificate", or "kl": at iteration k already (status STOPPED, unless the bounds are narrow by then).
 
     Returns:
-        A Solution with ``k`` (None if the KL test never held) and the certificate, which the last value carries after
-        a few Newton steps where its rounding alone keeps the bounds apart. Status REDUCIBLE, and no theta,
-        where the states that the start leads to are not one class, with ``target`` in both: the eigenvector needs
-        that (``solve_soft_bellman`` needs less, and the message says where it will do).
+        A Solution with ``k`` (None if the KL test never held) and the certificate of the last value. Where rounding
+        alone keeps the bounds apart, a few Newton steps improve that value first. Status REDUCIBLE, and no theta, where
+        the states that the start leads to are not one class (with ``target``, in one of the two MDPs): the eigenvector
+        needs that. ``solve_soft_bellman`` needs less; the message says where it serves.
 
     Raises:
         InputError: an argument out of range, or a target of another shape.
     """
     checks.one_of("stop", stop, ("certificate", "kl"))
     checks.positive("tol", tol)
-    problem, known = _problems(mdp, beta, prior_policy, target)
-    message = _no_eigenvector(problem, known)
+    problem, source = _problems(mdp, beta, prior_policy, target)
+    message = _no_eigenvector(problem, source)
     if message:
-        found = reducible_solution(target or mdp, problem, prior_policy)
+        solution = reducible_solution(target or mdp, problem, prior_policy)
         if problem.regeneration_state() is not None:
             message += ". Soft policy iteration needs one closed set only"
-            message += "" if known is None else ", of target's"
-        return replace(found, message=message)
+            message += "" if source is None else ", of target's"
+        return replace(solution, message=message)
     k: int | None = None
     state: BiasingState | None = None
     for state in iterate_biasing(mdp, beta, prior_policy, target, max_steps):
@@ -106,10 +106,14 @@ def solve_biasing(
             break
     assert state is not None
     if stop == "kl" and k is not None:
-        found = ended(target or mdp, problem, state.value, state.theta_bounds, tol, k + 1, max_steps, prior_policy, k)
-        if found.status is not Status.CONVERGED:
-            found = replace(found, status=Status.STOPPED, message="at the first iteration with KL < 1e-6, as asked for")
-        return found
+        solution = ended(
+            target or mdp, problem, state.value, state.theta_bounds, tol, k + 1, max_steps, prior_policy, k
+        )
+        if solution.status is not Status.CONVERGED:
+            solution = replace(
+                solution, status=Status.STOPPED, message="at the first iteration with KL < 1e-6, as asked for"
+            )
+        return solution
     value, bounds = state.value, state.theta_bounds
     if state.k + 1 < max_steps:
         value, bounds = polish(problem, value, bounds, tol)
@@ -119,11 +123,11 @@ def solve_biasing(
 def iterate_biasing(
     mdp: TabularMDP,
     beta: float,
-    prior_policy: Any = None,
+    prior_policy: ArrayLike | None = None,
     target: TabularMDP | None = None,
     max_steps: int = 200,
 ) -> Iterator[BiasingState]:
-    """Every biasing iteration; ends after ``max_steps``, or when rounding ends progress.
+    """Yield every biasing iteration, until ``max_steps``, or until rounding ends progress.
 
     Args:
         mdp, beta, prior_policy, target: as in ``solve_biasing``.
@@ -133,26 +137,28 @@ def iterate_biasing(
         InputError: an argument out of range, a target of another shape, or an MDP (``mdp`` or ``target``) whose start
             leads to states that are not one class.
     """
-    problem, known = _problems(mdp, beta, prior_policy, target)
+    problem, source = _problems(mdp, beta, prior_policy, target)
     checks.at_least("max_steps", max_steps, 1)
-    message, ref = _no_eigenvector(problem, known), problem.regeneration_state()
+    message, ref = _no_eigenvector(problem, source), problem.regeneration_state()
     if message or ref is None:
         raise InputError("mdp", message, "one class of states, for an eigenvector")
-    return _iterate(problem, ref, known, max_steps)
+    return _iterate(problem, ref, source, max_steps)
 
 
-def _iterate(problem: BellmanProblem, ref: int, known: BellmanProblem | None, max_steps: int) -> Iterator[BiasingState]:
-    """``known``: solved for in iteration 0, if it is not ``problem``."""
+def _iterate(
+    problem: BellmanProblem, ref: int, source: BellmanProblem | None, max_steps: int
+) -> Iterator[BiasingState]:
+    """``source``: the problem of iteration 0; None where it is ``problem``."""
     beta = problem.beta
     pattern = NewtonPattern.of(problem)
-    known_pattern = pattern if known is None else NewtonPattern.of(known)
+    source_pattern = pattern if source is None else NewtonPattern.of(source)
     value = np.zeros(problem.n_states)
     lower, upper = -np.inf, np.inf
     shift_before = width = np.inf
     lost, kl_before = 0, np.full(problem.reward.size, np.inf)
     for k in range(max_steps):
-        at, its_pattern = (known or problem, known_pattern) if k == 0 else (problem, pattern)
-        h, bounds, status, newton_steps = _eigenvector(at, value, its_pattern, ref)
+        at, at_pattern = (source or problem, source_pattern) if k == 0 else (problem, pattern)
+        h, bounds, status, newton_steps = _eigenvector(at, value, at_pattern, ref)
         log_psi = -beta * value
         # The policy and the dynamics that are optimal in the biased problem.
         log_mean, kl, tilted = at.tilt(h)
@@ -164,10 +170,10 @@ def _iterate(problem: BellmanProblem, ref: int, known: BellmanProblem | None, ma
         new -= new[ref]
         if np.isfinite(new).all():
             value = new
-        elif k:  # the eigenvector was lost: the value of before is the last
+        elif k:  # the eigenvector is not finite: the value before is the last
             return
-        proven = problem.gains(value)
-        lower, upper = max(lower, proven.theta_bounds[0]), min(upper, proven.theta_bounds[1])
+        gains = problem.gains(value)
+        lower, upper = max(lower, gains.theta_bounds[0]), min(upper, gains.theta_bounds[1])
         yield BiasingState(
             k=k,
             log_psi=log_psi,
@@ -184,7 +190,7 @@ def _iterate(problem: BellmanProblem, ref: int, known: BellmanProblem | None, ma
         if shift <= 1e-13 * (1 + np.abs(beta * value).max()) and shift >= 0.5 * shift_before:
             return
         shift_before = shift
-        # No eigenvector, and dynamics that no longer change: the value runs away, by the same step each time.
+        # No eigenvector, and dynamics that no longer change: the value runs away by the same step in each iteration.
         lost += 1
         moved = not np.allclose(kl, kl_before, rtol=KL_TOLERANCE, atol=KL_TOLERANCE)
         if status is Status.CONVERGED or moved or upper - lower < 0.5 * width:
@@ -195,27 +201,27 @@ def _iterate(problem: BellmanProblem, ref: int, known: BellmanProblem | None, ma
 
 
 def _problems(
-    mdp: TabularMDP, beta: float, prior_policy: Any, target: TabularMDP | None
+    mdp: TabularMDP, beta: float, prior_policy: ArrayLike | None, target: TabularMDP | None
 ) -> tuple[BellmanProblem, BellmanProblem | None]:
-    """(what is to be solved, what is known of it before, if that is another)."""
-    known = BellmanProblem.of(mdp, beta, prior_policy)
+    """(the problem to be solved, the problem known before; None where they are the same)."""
+    source = BellmanProblem.of(mdp, beta, prior_policy)
     if target is None:
-        return known, None
+        return source, None
     checks.instance("target", target, TabularMDP, "a TabularMDP")
     if target.reward.shape != mdp.reward.shape:
         raise InputError("target", f"MDP of shape {target.reward.shape}", f"of the shape of mdp, {mdp.reward.shape}")
     problem = BellmanProblem.of(target, beta, prior_policy)
-    if not np.array_equal(problem.states, known.states):
+    if not np.array_equal(problem.states, source.states):
         raise InputError("target", "MDP", "one whose start leads to the same states as that of mdp")
-    return problem, known
+    return problem, source
 
 
-def _no_eigenvector(problem: BellmanProblem, known: BellmanProblem | None) -> str:
+def _no_eigenvector(problem: BellmanProblem, source: BellmanProblem | None) -> str:
     """Why one of the two has no eigenvector that is positive everywhere; empty where both have."""
     if len(problem.classes[1]) > 1:
         return explain_classes(problem)
-    if known is not None and len(known.classes[1]) > 1:
-        return f"known before, beside target: {explain_classes(known)}"
+    if source is not None and len(source.classes[1]) > 1:
+        return f"known before, beside target: {explain_classes(source)}"
     return ""
 
 
@@ -225,9 +231,9 @@ def _eigenvector(
     """Right eigenvector of M_V as its logarithm, with bounds on beta G(V)."""
     log_weight = problem.beta * (problem.action_value(value) - value[:, None])
     if pattern is not None:
-        found = pattern.eigenvector(log_weight + np.log(problem.prior), ref, RTOL, MAX_NEWTON_STEPS)
-        if found is not None:
-            h, bounds, steps = found
+        eigenvector = pattern.eigenvector(log_weight + np.log(problem.prior), ref, RTOL, MAX_NEWTON_STEPS)
+        if eigenvector is not None:
+            h, bounds, steps = eigenvector
             return h, bounds, Status.CONVERGED, steps
 
     ptr, ind, slot = problem.pattern

@@ -69,11 +69,11 @@ def _soft_maximum(q, weight, beta, choice):
         logarithm = largest + math.log(summed) - math.log(total)
     for a in range(n):
         choice[a] /= summed
-    found = top + logarithm / beta
+    maximum = top + logarithm / beta
     size = -logarithm if below >= -0.5 else abs(logarithm) + math.log(n)
     # The last: products that underflow.
-    rounding = (2 * n + 20) * epsilon * abs(size) / beta + 2.0 * epsilon * abs(found) + (n + 1) * 1e-323 / beta
-    return found, rounding
+    rounding = (2 * n + 20) * epsilon * abs(size) / beta + 2.0 * epsilon * abs(maximum) + (n + 1) * 1e-323 / beta
+    return maximum, rounding
 
 
 @numba.njit(cache=True, error_model="numpy", nogil=True)
@@ -121,7 +121,7 @@ def _relative_entropy(policy, prior):
     """
     epsilon = 2.0**-52
     n = policy.size
-    total, of_prior, found, size = 0.0, 0.0, 0.0, 0.0
+    total, of_prior, kl, size = 0.0, 0.0, 0.0, 0.0
     same = True
     for a in range(n):
         total += policy[a]
@@ -137,7 +137,7 @@ def _relative_entropy(policy, prior):
             for j in range(2, 20):
                 power *= -x
                 h -= power / (j * (j - 1))
-            found += prior[a] * h
+            kl += prior[a] * h
             size += policy[a] * abs(x)
         elif policy[a] > 0.0:
             ratio = policy[a] / prior[a]
@@ -146,16 +146,16 @@ def _relative_entropy(policy, prior):
             if 1e-300 < ratio < 1e300:
                 logarithm = math.log(ratio)
                 spoilt = abs(logarithm) + 1.0
-            found += policy[a] * logarithm - (policy[a] - prior[a])
+            kl += policy[a] * logarithm - (policy[a] - prior[a])
             size += policy[a] * spoilt + abs(policy[a] - prior[a])
         else:
-            found += prior[a]
+            kl += prior[a]
     if same:
         return 0.0, 0.0
     apart = (abs(total - of_prior) + (n + 2) * epsilon) / total
-    found = max(found / total, 0.0)
-    rounding = (n + 40) * epsilon * found + 8.0 * epsilon * size + n * 1e-322  # the last: products that underflow
-    return max(found - rounding - apart * apart, 0.0), found + rounding
+    kl = max(kl / total, 0.0)
+    rounding = (n + 40) * epsilon * kl + 8.0 * epsilon * size + n * 1e-322  # the last: products that underflow
+    return max(kl - rounding - apart * apart, 0.0), kl + rounding
 
 
 @numba.njit(cache=True, error_model="numpy", nogil=True)

@@ -5,15 +5,15 @@ T_pi V(s) = sum_a pi (r + E V - log(pi/prior)/beta),
 
     min(TV - V) <= J(pi_V) <= -theta* <= max(TV - V)        and        min(T_pi V - V) <= J(pi) <= max(T_pi V - V),
 
-whatever the chain; of the second the states suffice that pi comes back to for ever. Proof: TV - V is the one-step
-regularised reward of pi_V with the difference V(s') - V(s) added, which averages to nothing under a stationary
-distribution; and of all policies pi_V has the largest such reward in every state.
+whatever the chain. In the second, minimum and maximum over the states that pi comes back to for ever suffice. Proof:
+TV - V is the one-step regularised reward of pi_V with the difference V(s') - V(s) added, which averages to nothing
+under a stationary distribution; and of all policies pi_V has the largest such reward in every state.
 
 The compiled rows (``certificate_kernels.gain_rows``, ``certificate_kernels.policy_gain_rows``) return each gain with
-a lower and an upper end that rounding cannot leave: E V - V(s) is a sum of p (V(s') - V(s)) over s' other than s, so
-that no digit is lost where a state is rarely left, and the error of an action counts as far as it is chosen
-(docs/theory.md, 6: every operation). The rows of transition, prior and policy are meant as divided by their sums,
-which are 1 but for rounding.
+a lower and an upper bound that rounding cannot leave. E V - V(s) is a sum of p (V(s') - V(s)) over s' other than s,
+so that no digit is lost where a state is rarely left. The error of an action counts as far as the action is chosen
+(docs/theory.md, 6: every operation). The rows of transition, prior and policy stand for the rows divided by their
+sums, which are 1 but for rounding.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ from erl_torch.solvers.chains import (
     reachable_from,
 )
 
-SHARP = 1e-11  # of a policy's worth, relative to what it earns: where bounds are as narrow, nothing more is tried
+SHARP_WIDTH = 1e-11  # of bounds on J, relative to J: where they are as narrow, nothing more is tried
 
 
 class Gains(NamedTuple):
-    """TV - V with what rounding can have done to it, and the policy that attains it."""
+    """TV - V with bounds on its rounding, and the policy that attains it."""
 
     gain: np.ndarray  # [S]
     low: np.ndarray  # [S]
@@ -86,9 +86,9 @@ def soft_backup(q: np.ndarray, prior: np.ndarray, beta: float) -> tuple[np.ndarr
 
 
 class Objective(NamedTuple):
-    """J(pi), the long-run reward rate less KL/beta from the start, reward a step."""
+    """J(pi), the long-run reward rate less KL/beta from the start, reward per step."""
 
-    value: float  # J but for rounding; only somewhere between low and high where products of probabilities underflow
+    value: float  # J but for rounding; where products of probabilities underflow, anywhere between low and high
     low: float  # low <= J <= high in exact arithmetic
     high: float
 
@@ -103,17 +103,17 @@ def objective(
 ) -> Objective:
     """J(policy) with bounds.
 
-    Three ways to bound it hold together: the one-step rewards of the states that the policy comes back to (V = 0), the
-    gains of its relative value, and its shares of time where the elimination's error is known. Where products of
-    probabilities underflow, ``value`` is only somewhere between the bounds. The KL of states that the policy leaves for
-    ever does not count.
+    Three bounds hold together: that of the one-step rewards of the states that the policy comes back to (V = 0), that
+    of the gains of its relative value, and that of its shares of time where the elimination's error is known. Where
+    products of probabilities underflow, ``value`` may be anywhere between the bounds. The KL of states that the policy
+    leaves for ever does not count.
     """
     n_states, n_actions = reward.shape
     policy = np.asarray(policy, np.float64)
     sums = policy.sum(1, keepdims=True)
     policy = np.where(np.abs(sums - 1) > 2e-15, policy / sums, policy)
     chain = policy_chain(transition, policy)
-    # Which state can follow which, whatever products of probabilities underflow.
+    # Which state can follow which, even where products of probabilities underflow.
     possible = sp.csr_array((np.ones(transition.nnz), transition.indices, transition.indptr), shape=transition.shape)
     pattern = policy_chain(possible, (policy > 0).astype(np.float64))
     label, closed = classes(pattern)
@@ -125,8 +125,8 @@ def objective(
     worth = one_step_worth(*within)
     if chain.nnz < pattern.nnz:
         share = _share(chain, start)
-        found = 0.5 * (low + high) if share is None else float(share.of_state @ worth)
-        return Objective(min(max(found, low), high), low, high)
+        middle = 0.5 * (low + high) if share is None else float(share.of_state @ worth)
+        return Objective(min(max(middle, low), high), low, high)
     ends_in = np.unique(label[ends])
     share = _share(chain, start) if ends.sum() <= GTH_STATES else None
     if share is None or not np.isfinite(share.relative_error):
@@ -135,22 +135,22 @@ def objective(
             again = policy_gains(transition, reward, prior, beta, policy, value)
             low, high = max(low, float(again[0][ends].min())), min(high, float(again[1][ends].max()))
         share = share or of_one
-        if high - low > SHARP * max(abs(low), abs(high)):
+        if high - low > SHARP_WIDTH * max(abs(low), abs(high)):
             share = _share(chain, start, dense=True) or share
         share = share or _share(chain, start)
     if share is None:
         return Objective(0.5 * (low + high), low, high)
     d = share.of_state[ends]
-    found = float(d @ worth[ends])
+    mean = float(d @ worth[ends])
     # The entries of the chain are sums over actions.
     error = share.relative_error + 2 * n_states * (n_actions + 24) * EPSILON
     if error < 0.1:
-        off = np.abs(worth[ends] - found)
-        slack = (1.2 * error + (len(d) + 8) * EPSILON) * float(d @ off) + (len(d) + 8) * EPSILON * abs(found)
+        off = np.abs(worth[ends] - mean)
+        slack = (1.2 * error + (len(d) + 8) * EPSILON) * float(d @ off) + (len(d) + 8) * EPSILON * abs(mean)
         slack += len(d) * 1e-300 * float(off.max())
-        low = max(low, found - 1.2 * float(d @ (worth - within[0])[ends]) - slack)
-        high = min(high, found + 1.2 * float(d @ (within[1] - worth)[ends]) + slack)
-    return Objective(found, min(low, found), max(high, found))
+        low = max(low, mean - 1.2 * float(d @ (worth - within[0])[ends]) - slack)
+        high = min(high, mean + 1.2 * float(d @ (within[1] - worth)[ends]) + slack)
+    return Objective(mean, min(low, mean), max(high, mean))
 
 
 def _share(chain: sp.csr_array, start: np.ndarray, dense: bool = False) -> Share | None:
@@ -161,7 +161,7 @@ def _share(chain: sp.csr_array, start: np.ndarray, dense: bool = False) -> Share
 
 
 def one_step_worth(low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """sum_a pi (r - log(pi/prior)/beta), [S], from its bounds; 0 where they are infinite."""
+    """sum_a pi (r - log(pi/prior)/beta), [S]: the middle of its bounds; 0 where they are infinite."""
     with np.errstate(invalid="ignore"):
         middle = low + 0.5 * (high - low)
     return np.where(np.isfinite(middle), middle, 0.0)
@@ -170,18 +170,19 @@ def one_step_worth(low: np.ndarray, high: np.ndarray) -> np.ndarray:
 def _by_regeneration(
     chain: sp.csr_array, worth: np.ndarray, label: np.ndarray, ends_in: np.ndarray
 ) -> tuple[np.ndarray | None, Share | None]:
-    """(relative value [S] of one-step rewards on the closed classes ``ends_in``, 0 elsewhere; the shares of time, if it
-    is one class); None where they cannot be had."""
+    """(relative value [S] of rewards ``worth`` on the closed classes ``ends_in``, 0 elsewhere; the shares of time where
+    there is one class). Each is None where it cannot be computed.
+    """
     value, share = np.zeros(len(worth)), None
     for c in ends_in:
-        inside = np.flatnonzero(label == c)
+        members = np.flatnonzero(label == c)
         try:
-            lu = RegenerativeLU.adapted(sp.csr_array(chain[inside][:, inside]), 0)
+            lu = RegenerativeLU.adapted(sp.csr_array(chain[members][:, members]), 0)
         except SingularChainError:
             return None, None
-        value[inside] = lu.poisson(worth[inside])[1]
+        value[members] = lu.poisson(worth[members])[1]
         if len(ends_in) == 1:
             of_state = np.zeros(len(worth))
-            of_state[inside] = lu.stationary()
+            of_state[members] = lu.stationary()
             share = Share(of_state, np.inf)
     return value, share

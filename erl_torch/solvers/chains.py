@@ -1,8 +1,8 @@
 """Markov chains: classes of states, shares of time, and linear equations solved by regeneration.
 
-A chain K [S, S] with a state ``ref`` that is reached from everywhere is cut at its visits to ``ref``: with A = I - K
-without the row and column of ``ref``, both the Poisson equation and the stationary distribution are solves with the
-LU of A, a nonsingular M-matrix (stable without pivoting), and no dense column spoils its sparsity where many states
+A chain K [S, S] with a state ``ref`` that is reached from everywhere is cut at its visits to ``ref``. Let A be I - K
+without the row and column of ``ref``. The LU of A solves both the Poisson equation and the stationary distribution.
+A is a nonsingular M-matrix (stable without pivoting), and no dense column spoils its sparsity where many states
 restart at ``ref``.
 
 The diagonal of A is never a difference: it is the sum of the rest of its row, and so is every pivot (Grassmann,
@@ -24,10 +24,10 @@ import scipy.sparse.linalg as spla
 from erl_torch.solvers import kernels
 
 GTH_STATES = 100  # up to here the dense elimination is the faster
-DENSE_STATES = 2000  # up to here it is done where nothing else will do: seconds, 32 MB
-SPARSE_STATES = 4000
+DENSE_STATES = 2000  # up to here it serves where nothing else does: seconds, 32 MB
+ORDERED_STATES = 4000  # up to here the elimination has an order of its own
 EPSILON = float(np.finfo(np.float64).eps)
-MAX_OPERATIONS = 15_000_000  # multiplications of one compiled LU: some ten milliseconds
+MAX_OPERATIONS = 15_000_000  # multiplications of one compiled LU: about ten milliseconds
 
 
 class SingularChainError(ArithmeticError):
@@ -35,10 +35,10 @@ class SingularChainError(ArithmeticError):
 
 
 def reachable_from(chain: sp.csr_array, start: np.ndarray) -> np.ndarray:
-    """[S] bool: states that have a path from the support of ``start`` [S]; ``chain`` CSR [S, S], its pattern counts."""
+    """[S] bool: states with a path from the support of ``start`` [S], in the pattern of ``chain``, CSR [S, S]."""
     n = len(start)
     sources = np.flatnonzero(start > 0)
-    # One more state, with an edge to every source.
+    # One search from one more state, with an edge to every source.
     indptr = np.concatenate([chain.indptr, [chain.indptr[-1] + len(sources)]])
     indices = np.concatenate([chain.indices, sources])
     graph = sp.csr_array((np.ones(len(indices), np.int8), indices, indptr), shape=(n + 1, n + 1))
@@ -49,7 +49,7 @@ def reachable_from(chain: sp.csr_array, start: np.ndarray) -> np.ndarray:
 
 
 def classes(chain: sp.csr_array) -> tuple[np.ndarray, np.ndarray]:
-    """(label [S], closed [n_classes] bool): strongly connected classes, and which of them cannot be left."""
+    """(label [S], closed [n_classes] bool): the strongly connected class of each state; the classes without exit."""
     n_classes, label = csgraph.connected_components(chain, directed=True, connection="strong")
     origin = np.repeat(np.arange(chain.shape[0]), np.diff(chain.indptr))
     leaves = label[origin] != label[chain.indices]
@@ -68,23 +68,23 @@ def likely_state(chain: sp.csr_array, steps: int = 64) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Elimination:
-    """An order in which to eliminate the states of chains of one pattern, and the fill of their LU factors."""
+    """The order in which the states of chains of one pattern are eliminated, and the fill of their LU factors."""
 
     ptr: np.ndarray  # [n + 1], CSR of the pattern
     ind: np.ndarray
-    rank: np.ndarray  # [n], place in the elimination; as the states come where the chains are too large to be ordered
+    rank: np.ndarray  # [n], place in the elimination; the state itself where the chains are too large to be ordered
     lu: tuple[np.ndarray, ...]  # (lptr, lind, uptr, uind) of ``kernels.lu_pattern``; empty: too large, or too much fill
 
     @classmethod
     def of(cls, ptr: np.ndarray, ind: np.ndarray) -> Elimination:
         """For CSR chains (ptr, ind)."""
         n = len(ptr) - 1
-        if n > SPARSE_STATES:
+        if n > ORDERED_STATES:
             return cls(ptr, ind, np.arange(n, dtype=np.int32), ())
-        # Any values will do: SuperLU is asked for its minimum-degree ordering alone.
-        some = 2 * sp.eye_array(n) - sp.csr_array((np.full(ind.size, 1.0 / n), ind, ptr), shape=(n, n))
+        # Any values serve: only SuperLU's minimum-degree ordering is used.
+        matrix = 2 * sp.eye_array(n) - sp.csr_array((np.full(ind.size, 1.0 / n), ind, ptr), shape=(n, n))
         ordered = spla.splu(
-            some.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+            matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
         )
         rank = ordered.perm_c.astype(np.int32)
         ptr, ind = ptr.astype(np.int64), ind.astype(np.int32)
@@ -97,17 +97,17 @@ class Elimination:
 
     @cached_property
     def order(self) -> np.ndarray:
-        """The states as they are eliminated, [n]."""
+        """The states in the order of elimination, [n]."""
         return np.argsort(self.rank)
 
     @cached_property
     def column(self) -> np.ndarray:
-        """Rank of the successor, entry by entry."""
+        """Rank of the successor of each entry."""
         return np.asarray(self.rank[self.ind])
 
 
 class _CompiledLU:
-    """LU of I - K, cut at ``ref``, without a subtraction; ``data`` are K's entries on the elimination's pattern."""
+    """LU of I - K, cut at ``ref``, without a subtraction; ``data``: K's entries on the elimination's pattern."""
 
     def __init__(self, elimination: Elimination, data: np.ndarray, ref: int, leak: float) -> None:
         e, n = elimination, len(elimination.rank)
@@ -148,7 +148,7 @@ class _CompiledLU:
 
 
 class _SuperLU:
-    """The same by SuperLU, for factors that are large."""
+    """The same by SuperLU, for large factors."""
 
     def __init__(self, elimination: Elimination, chain: sp.csr_array, ref: int, leak: float, row: np.ndarray) -> None:
         n = chain.shape[0]
@@ -156,13 +156,13 @@ class _SuperLU:
         away = chain.indices != origin
         diagonal = np.bincount(origin[away], chain.data[away], n) + leak
         diagonal[ref] = 1.0
-        if not (diagonal > 0).all():  # SuperLU reads outside its arrays where a diagonal entry is missing
+        if not (diagonal > 0).all():  # where a diagonal entry is missing, SuperLU reads outside its arrays
             raise SingularChainError(f"state {int(np.argmin(diagonal))} is never left")
         kept = away & (chain.indices != ref) & (origin != ref)
         rank = elimination.rank
         off = sp.csr_array((-chain.data[kept], (rank[origin[kept]], rank[chain.indices[kept]])), shape=(n, n))
         cut = sp.csc_array(off + sp.diags_array(diagonal[elimination.order]))
-        ordering = "MMD_AT_PLUS_A" if n > SPARSE_STATES else "NATURAL"  # ordered already
+        ordering = "MMD_AT_PLUS_A" if n > ORDERED_STATES else "NATURAL"  # up to there the rank has ordered them
         try:
             # No pivoting: an M-matrix needs none, and the fill stays what the ordering makes it.
             self._lu = spla.splu(cut, permc_spec=ordering, diag_pivot_thresh=0.0, options={"SymmetricMode": True})
@@ -174,16 +174,16 @@ class _SuperLU:
         return np.asarray(self._lu.solve(x[self._elimination.order], transposed)[self._elimination.rank])
 
     def visits(self) -> np.ndarray:
-        found = np.maximum(self.solve(self._row, "T"), 0.0)
-        found[self._ref] = 1.0
-        return np.asarray(found)
+        visits = np.maximum(self.solve(self._row, "T"), 0.0)
+        visits[self._ref] = 1.0
+        return np.asarray(visits)
 
 
 class RegenerativeLU:
     """LU of I - discount * ``chain``, cut at ``ref``; ``chain`` is a row-stochastic CSR [S, S].
 
-    ``elimination``: of the chain's pattern, where it is known already. With discount 1, raises SingularChainError if
-    ``ref`` is not reached from everywhere.
+    ``elimination``: that of the chain's pattern, where the caller has it. With discount 1, raises SingularChainError
+    if ``ref`` is not reached from everywhere.
     """
 
     def __init__(
@@ -211,7 +211,7 @@ class RegenerativeLU:
 
     @classmethod
     def adapted(cls, chain: sp.csr_array, ref: int, elimination: Elimination | None = None) -> RegenerativeLU:
-        """Cut at ``ref``, or at the likeliest state where ``ref`` is so rare that digits would be lost."""
+        """The LU cut at ``ref``, or at the likeliest state where ``ref`` is so rare that digits would be lost."""
         try:
             lu = cls(chain, ref, elimination=elimination)
             elimination = lu.elimination
@@ -230,7 +230,7 @@ class RegenerativeLU:
 
         With x = c + discount K x, the discounted value, w = x - x[ref] and gain = (1 - discount) x[ref].
         """
-        with np.errstate(over="ignore", invalid="ignore"):  # the callers look at what comes out
+        with np.errstate(over="ignore", invalid="ignore"):  # the callers check the result
             gain, w = self._poisson(c)
             if not refine:
                 return gain, w
@@ -255,7 +255,7 @@ class Share(NamedTuple):
     """Long-run shares of time."""
 
     of_state: np.ndarray  # [S], sums to 1
-    relative_error: float  # of each share, at most, had the chain's entries no error; infinite: not known
+    relative_error: float  # of each share, at most, if the chain's entries have none; infinite where not known
 
 
 def policy_chain(transition: sp.csr_array, policy: np.ndarray) -> sp.csr_array:
@@ -272,7 +272,7 @@ def long_run(chain: sp.csr_array, start: np.ndarray, dense: bool = False) -> Sha
     """Long-run share of time in each state, from ``start`` [S]; chain CSR [S, S], its diagonal is not read.
 
     Periodic chains and chains with several closed classes are fine: each class counts by the probability of ending in
-    it. ``dense``: eliminate densely, for the sake of a known error, also where there are many states.
+    it. ``dense``: eliminate densely also where there are many states, because the error is known then.
 
     Raises SingularChainError for a class of more than DENSE_STATES states that falls apart in double precision.
     """
@@ -286,31 +286,36 @@ def long_run(chain: sp.csr_array, start: np.ndarray, dense: bool = False) -> Sha
     weight, ending_error = _ending(chain, start, reached, label, ends, dense)
     share, error = np.zeros(len(start)), 0.0
     for c, mass in zip(ends, weight, strict=True):
-        inside = np.flatnonzero(label == c)
-        part = stationary(chain if len(inside) == len(start) else sp.csr_array(chain[inside][:, inside]), dense)
-        share[inside] = mass * part.of_state
-        error = max(error, part.relative_error)
+        members = np.flatnonzero(label == c)
+        own = stationary(chain if len(members) == len(start) else sp.csr_array(chain[members][:, members]), dense)
+        share[members] = mass * own.of_state
+        error = max(error, own.relative_error)
     return Share(share, error + ending_error)
 
 
 def stationary(chain: sp.csr_array, dense: bool = False) -> Share:
-    """Of one closed class [S, S], entries > 0. Parts of it may be all but closed. Raises as ``long_run``."""
+    """Shares of time in one closed class [S, S], entries > 0; sets of its states may be all but closed.
+
+    Raises as ``long_run``.
+    """
     n = chain.shape[0]
-    found = _dense_stationary(chain) if n <= (DENSE_STATES if dense else GTH_STATES) else None
-    if found is None or not np.isfinite(found.relative_error):
+    share = _dense_stationary(chain) if n <= (DENSE_STATES if dense else GTH_STATES) else None
+    if share is None or not np.isfinite(share.relative_error):
         try:
             return Share(RegenerativeLU.adapted(chain, 0).stationary(), np.inf)
         except SingularChainError:
-            if found is None and n <= DENSE_STATES and not dense:
-                found = _dense_stationary(chain)
-            if found is None:
+            if share is None and n <= DENSE_STATES and not dense:
+                share = _dense_stationary(chain)
+            if share is None:
                 raise
-    return found
+    return share
 
 
 def _dense_stationary(chain: sp.csr_array) -> Share | None:
-    """By dense elimination, S^3/3 steps, with the error that rounding can have made (docs/theory.md, 6); None where
-    products of probabilities leave double precision."""
+    """``stationary`` by dense elimination, S^3/3 steps, with a bound on its rounding (docs/theory.md, 6).
+
+    None where products of probabilities leave double precision.
+    """
     n = chain.shape[0]
     if n == 1:
         return Share(np.ones(1), 0.0)
@@ -323,8 +328,10 @@ def _dense_stationary(chain: sp.csr_array) -> Share | None:
 def _ending(
     chain: sp.csr_array, start: np.ndarray, reached: np.ndarray, label: np.ndarray, ends: np.ndarray, dense: bool
 ) -> tuple[np.ndarray, float]:
-    """(probability [n_ends] of ending in each of the classes ``ends``, its relative error): shares of time in a chain
-    that begins anew once it is in one of them."""
+    """(probability [n_ends] of ending in each of the classes ``ends``, its relative error).
+
+    They are the shares of time in a chain that begins anew once it is in one of these classes.
+    """
     if len(ends) == 1:
         return np.ones(1), 0.0
     passing = np.flatnonzero(reached & ~np.isin(label, ends))

@@ -1,16 +1,15 @@
-"""The dominant eigenpair of a nonnegative matrix, every component accurate, in logarithms.
+"""The dominant eigenpair of a nonnegative matrix, in logarithms: every component is accurate.
 
 M y = rho y with y = exp(h). F(h) = log(M exp(h)) is convex and monotone, its derivative K is row-stochastic, and the
-Collatz-Wielandt numbers min(F(h) - h) <= log rho <= max(F(h) - h) bound the root for every h. A few power steps
-h <- F(h), then Newton steps: (K - I) dh + (F(h) - h) = const, one sparse LU each, quadratic, also where power
-iteration needs a million steps (nearly periodic, nearly reducible). Stop on the spread of the bounds; a small
-residual norm would say nothing about small components.
+Collatz-Wielandt numbers min(F(h) - h) <= log rho <= max(F(h) - h) bound the root for every h. The solver makes a few
+power steps h <- F(h), then Newton steps (K - I) dh + (F(h) - h) = const, one sparse LU each. They converge
+quadratically, also where power iteration needs a million steps (nearly periodic, nearly reducible). It stops on the
+spread of the bounds: a small residual norm would say nothing about small components.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -22,11 +21,11 @@ from erl_torch.solution import Status
 from erl_torch.solvers import kernels
 from erl_torch.solvers.chains import EPSILON, Elimination, RegenerativeLU, SingularChainError, classes, likely_state
 
-POWER_STEPS = 300  # cheap ones, on the matrix itself
+POWER_STEPS = 300  # on the matrix itself, where they are cheap
 LOG_POWER_STEPS = 40
-REFUSALS = 5  # chains that fall apart, each followed by more power steps
+REFUSALS = 5  # chains that have no LU; more power steps follow each
 STEPS_AFTER_A_REFUSAL = 200
-NEAR = 0.1  # difference of the gains F(h) - h from where Newton is quadratic
+NEWTON_SPREAD = 0.1  # of the gains F(h) - h, from which on Newton converges quadratically
 LARGEST_ENTRY = 1e300  # of a matrix: the sum of a row stays in double precision
 
 
@@ -50,14 +49,14 @@ class PerronPair:
         return self.log_vector.exp()
 
 
-def perron(matrix: Any, rtol: float = 1e-13, max_steps: int = 60) -> PerronPair:
+def perron(matrix: object, rtol: float = 1e-13, max_steps: int = 60) -> PerronPair:
     """Dominant eigenvalue and right eigenvector of a nonnegative irreducible matrix [n, n].
 
     Args:
-        matrix: sparse (scipy, torch) or any array of real numbers, entries in [0, 1e300]; for the left eigenvector pass
-            its transpose.
-        rtol: spread of the Collatz-Wielandt bounds, relative to the root, to stop at; > 0.
-        max_steps: Newton steps, >= 1.
+        matrix: sparse (scipy, torch) or any array of real numbers, entries in [0, 1e300]. Pass the transpose for the
+            left eigenvector.
+        rtol: spread of the Collatz-Wielandt bounds, relative to the root, at which to stop; > 0.
+        max_steps: Newton steps at most, >= 1.
 
     Returns:
         The pair; status REDUCIBLE (message names the classes) if no positive eigenvector exists.
@@ -77,8 +76,8 @@ def perron(matrix: Any, rtol: float = 1e-13, max_steps: int = 60) -> PerronPair:
     label, closed = classes(m)
     if len(closed) > 1 or m.nnz == 0:
         sizes = np.bincount(label)
-        shown = ", ".join(f"{np.flatnonzero(label == c)[:4].tolist()}" for c in range(min(len(sizes), 5)))
-        message = f"{len(sizes)} classes of states, the first begin with {shown}: solve each apart"
+        first_states = ", ".join(f"{np.flatnonzero(label == c)[:4].tolist()}" for c in range(min(len(sizes), 5)))
+        message = f"{len(sizes)} classes of states, the first begin with {first_states}: solve each apart"
         nothing = torch.full((n,), torch.nan, dtype=torch.float64)
         return PerronPair(np.nan, nothing, (-np.inf, np.inf), Status.REDUCIBLE, 0, message)
     y = np.ones(n)
@@ -103,8 +102,8 @@ def solve_log_perron(
 ) -> tuple[np.ndarray, tuple[float, float], Status, int]:
     """(h [n], bounds on log rho, status, Newton steps) of M exp(h) = rho exp(h), for M = exp(log_m) as CSR (ptr, ind).
 
-    ``start`` [n]; ``terms`` of the longest row, also those that were summed on the way to log_m; ``elimination`` of the
-    pattern, where it is known already.
+    ``start`` [n]; ``terms``: those of the longest row, with those that were summed to make log_m; ``elimination``: that
+    of the pattern, where the caller has it.
     """
 
     def power(h: np.ndarray, steps: int, near: float) -> _Point:
@@ -116,7 +115,7 @@ def solve_log_perron(
         new = at.h + lu.poisson(at.gain)[1]
         return power(new - new.max(), 0, 0.0)
 
-    at = power(start, power_steps, NEAR)
+    at = power(start, power_steps, NEWTON_SPREAD)
     ref = likely_state(at.chain)
     best = at
     refused, before = 0, np.inf
@@ -130,7 +129,7 @@ def solve_log_perron(
             break
         try:
             new = newton(at, lu) if lu else at
-            # The factors of an earlier step will do where they still gain two digits.
+            # Keep the factors of an earlier step while they still gain two digits.
             if lu is None or not new.spread < 1e-2 * spread:
                 lu = RegenerativeLU.adapted(at.chain, ref, elimination)
                 ref = lu.ref

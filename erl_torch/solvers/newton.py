@@ -1,8 +1,9 @@
 """The eigenvector of M_V by a compiled Newton iteration, for chains whose LU factors stay sparse.
 
-The states' pattern never changes between biasing iterations and Newton steps: it is ordered and its fill found once,
-and every step is then one loop over known places. The method is that of ``eigenpair.solve_log_perron``, which takes
-over where the fill is large (a supernodal LU is faster there) or a chain falls apart within rounding.
+The pattern of the states' transitions is the same in all biasing iterations and Newton steps. So its order and its
+fill are computed once, and every step is one loop over their places. The method is that of
+``eigenpair.solve_log_perron``, which takes over where the fill is large (a supernodal LU is faster there) or where a
+chain falls apart within rounding.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ class NewtonPattern:
 
     @classmethod
     def of(cls, problem: BellmanProblem) -> NewtonPattern | None:
-        """None where the problem is too large or its factors fill too much."""
+        """The pattern of ``problem``; None where that is too large or its factors fill too much."""
         if not problem.elimination.fits:
             return None
         p = problem.transition

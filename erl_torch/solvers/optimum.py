@@ -1,10 +1,11 @@
-"""The exact optimum as what learnt policies are measured against."""
+"""The optimum of a known model, and how far a solution is from it."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from erl_torch.checks import InputError
 from erl_torch.mdp.tabular import TabularMDP, check_policy
@@ -14,16 +15,16 @@ from erl_torch.solvers.policy import kl_per_state, policy_chain, stationary_dist
 
 
 class Optimum(NamedTuple):
-    """The exact solution that policies are measured against."""
+    """The proven solution of a model, which other solutions are measured against."""
 
-    theta: float  # reward a step
+    theta: float  # reward per step
     policy: np.ndarray  # [S, A]
     log_policy: np.ndarray  # [S, A], finite also where the policy underflows
     stationary: np.ndarray  # [S], of that policy
 
 
-def optimum(mdp: TabularMDP, beta: float, prior_policy: Any = None) -> Optimum:
-    """The exact solution. Raises InputError unless the solver has proven it."""
+def solve_optimum(mdp: TabularMDP, beta: float, prior_policy: ArrayLike | None = None) -> Optimum:
+    """The optimum of ``mdp``. Raises InputError unless the solver has proven it."""
     solution = solve_soft_bellman(mdp, beta, prior_policy)
     if solution.status is not Status.CONVERGED:
         raise InputError(
@@ -42,18 +43,24 @@ def optimum(mdp: TabularMDP, beta: float, prior_policy: Any = None) -> Optimum:
     )
 
 
-def measure(mdp: TabularMDP, best: Optimum, solution: Solution, beta: float) -> dict[str, float]:
-    """gap, kl, kl_states, theta_error and n_steps of one solution."""
+def measure(mdp: TabularMDP, optimum: Optimum, solution: Solution, beta: float) -> dict[str, float]:
+    """How far ``solution`` is from ``optimum``.
+
+    Returns:
+        gap, g* - J(policy), reward per step; kl, KL(optimal policy || policy), nats, averaged over the long run of the
+        optimal policy; kl_states, the same averaged over states; theta_error, reward per step, NaN where the solution
+        has no theta; n_steps.
+    """
     policy = solution.policy.detach().cpu().numpy()
     own = stationary_distribution(policy_chain(mdp, policy).transition, mdp.start)
     with np.errstate(divide="ignore", invalid="ignore"):
-        loss = np.where(policy > 0, policy * (np.log(policy) - best.log_policy), 0.0).sum(1)
-    kl = kl_per_state(best.policy, policy)
+        loss = np.where(policy > 0, policy * (np.log(policy) - optimum.log_policy), 0.0).sum(1)
+    kl = kl_per_state(optimum.policy, policy)
     return {
         "gap": max(_mean(own, loss), 0.0) / beta,
-        "kl": _mean(best.stationary, kl),
+        "kl": _mean(optimum.stationary, kl),
         "kl_states": float(kl.mean()),
-        "theta_error": np.nan if solution.theta is None else abs(solution.theta - best.theta),
+        "theta_error": np.nan if solution.theta is None else abs(solution.theta - optimum.theta),
         "n_steps": float(solution.n_steps),
     }
 

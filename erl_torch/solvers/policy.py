@@ -1,4 +1,4 @@
-"""What a policy is worth in a known MDP: its chain, its long run, reward rate and regularised objective.
+"""Evaluate a policy in a known MDP: its chain, its long run, reward rate and regularised objective.
 
 ``objective`` is J(pi) = reward rate - KL rate / beta, with KL(pi(.|s) || prior(.|s)) averaged over the
 states that the policy visits; its maximum over policies is -theta*.
@@ -17,7 +17,7 @@ from erl_torch.solvers.chains import long_run
 
 
 class PolicyChain(NamedTuple):
-    """The Markov chain that a policy makes of an MDP."""
+    """The Markov chain of an MDP under a policy."""
 
     transition: sp.csr_array  # [S, S]
     reward: np.ndarray  # [S]
@@ -46,8 +46,8 @@ def reward_per_step(mdp: TabularMDP, policy: np.ndarray, horizon: int) -> float:
 def stationary_distribution(transition: sp.csr_array, start: np.ndarray) -> np.ndarray:
     """Long-run share of time in each state, from ``start`` [S]; chain as CSR [S, S].
 
-    Periodic chains and chains with several closed classes are fine: each class counts by the probability
-    of ending in it. No digit is lost where the chain rarely moves between its parts (``erl_torch.solvers.chains``).
+    Periodic chains and chains with several closed classes are fine: each class counts by the probability of ending in
+    it. No digit is lost where the chain rarely moves between sets of states (``erl_torch.solvers.chains``).
     """
     return long_run(transition, start).of_state
 
@@ -64,9 +64,9 @@ def induced_distribution(mdp: TabularMDP, policy: np.ndarray, horizon: int | Non
 
 
 def objective(mdp: TabularMDP, policy: np.ndarray, prior: np.ndarray, beta: float) -> float:
-    """J(pi): stationary reward rate minus KL/beta, from the start distribution; reward a step.
+    """J(pi): stationary reward rate minus KL/beta, from the start distribution; reward per step.
 
-    Exact but for rounding, unless products of probabilities underflow: then it is somewhere between the bounds that
-    ``certificates.objective`` has beside the same figure.
+    Exact but for rounding. Where products of probabilities underflow, it may be anywhere between the bounds that
+    ``certificates.objective`` gives with it.
     """
     return certificates.objective(mdp.transition, mdp.reward, prior, beta, policy, mdp.start).value

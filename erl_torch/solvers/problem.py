@@ -2,7 +2,7 @@
 
     TV(s) = (1/beta) log sum_a prior(a|s) exp(beta (r(s,a) + E_{s'|s,a} V(s')))
 
-is its soft Bellman backup; ``erl_torch.solvers.certificates`` has what V and TV prove.
+is its soft Bellman backup; ``erl_torch.solvers.certificates`` has the bounds that V and TV prove.
 """
 
 from __future__ import annotations
@@ -10,10 +10,10 @@ from __future__ import annotations
 import contextlib
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
+from numpy.typing import ArrayLike
 
 from erl_torch import checks
 from erl_torch.mdp.tabular import TabularMDP, check_prior
@@ -34,7 +34,7 @@ class BellmanProblem:
     beta: float
 
     @classmethod
-    def of(cls, mdp: TabularMDP, beta: float, prior_policy: Any = None) -> BellmanProblem:
+    def of(cls, mdp: TabularMDP, beta: float, prior_policy: ArrayLike | None = None) -> BellmanProblem:
         """Restrict ``mdp``. Raises InputError for beta <= 0 or a prior that is 0 somewhere."""
         checks.instance("mdp", mdp, TabularMDP, "a TabularMDP")
         beta = checks.temperature("beta", beta)
@@ -61,13 +61,15 @@ class BellmanProblem:
         return float(np.ptp(self.reward)) or float(np.abs(self.reward).max()) or 1.0
 
     def scale_seen(self, policy: np.ndarray, bounds: tuple[float, float]) -> float:
-        """What tolerances are relative to, reward a step: max(|theta|, mean |r| that ``policy`` [n, A] meets in the
-        long run); rewards that it never meets do not count. Where both are 0 (or theta may be, by its ``bounds``), the
-        smallest |r| that is not."""
+        """What tolerances refer to, reward per step: max(|theta|, long-run mean of |r| under ``policy`` [n, A]).
+
+        Rewards that the policy never meets do not count. Where both are 0 (or theta may be, by its ``bounds``), the
+        scale is the smallest |r| that is not 0.
+        """
         if np.ptp(self.reward) == 0:
             return self.reward_range
         seen = max(bounds[0], -bounds[1], 0.0)
-        # A class that falls apart in double precision: theta alone.
+        # Where the class falls apart in double precision, theta alone counts.
         with contextlib.suppress(SingularChainError):
             share = self.regeneration(policy).stationary()
             seen = max(seen, float(share @ (policy * np.abs(self.reward)).sum(1)))
@@ -77,7 +79,7 @@ class BellmanProblem:
         return seen
 
     def is_narrow(self, bounds: tuple[float, float], tol: float, policy: np.ndarray) -> bool:
-        """Whether bounds on theta* are as narrow as ``tol`` asks, relative to what the policy behind them sees."""
+        """Whether bounds on theta* are as narrow as ``tol`` asks, relative to ``scale_seen`` by the policy."""
         width, theta = bounds[1] - bounds[0], 0.5 * (bounds[0] + bounds[1])
         if not width <= tol * self.reward_range:
             return False
@@ -85,7 +87,7 @@ class BellmanProblem:
         return width <= tol * abs(theta) or width <= tol * self.scale_seen(policy, bounds)
 
     def gains(self, value: np.ndarray) -> Gains:
-        """TV - V of ``value`` [n], with bounds."""
+        """TV - V of ``value`` [n], with bounds on its rounding."""
         return gains(self.transition, self.reward, self.prior, self.beta, value)
 
     @cached_property
@@ -100,25 +102,25 @@ class BellmanProblem:
     @cached_property
     def pattern(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """CSR (ptr, ind) of the states that can follow each, and the place of each transition entry in ind."""
-        found: tuple[np.ndarray, np.ndarray, np.ndarray] = kernels.state_pattern(
+        pattern: tuple[np.ndarray, np.ndarray, np.ndarray] = kernels.state_pattern(
             self.transition.indptr, self.transition.indices, self.n_actions
         )
-        return found
+        return pattern
 
     @cached_property
     def elimination(self) -> Elimination:
-        """Of all its chains."""
+        """The order of elimination that all chains of the problem share."""
         return Elimination.of(*self.pattern[:2])
 
     def chain(self, policy: np.ndarray, tilted: np.ndarray | None = None) -> sp.csr_array:
-        """CSR [n, n] of ``policy`` [n, A]; ``tilted`` replaces the transition probabilities, entry by entry."""
+        """The chain of ``policy`` [n, A], CSR [n, n]; ``tilted`` replaces the transition probabilities (CSR data)."""
         p, (ptr, ind, slot) = self.transition, self.pattern
         data = np.empty(len(ind))
         kernels.chain_of(p.data if tilted is None else tilted, slot, policy.reshape(-1), p.indptr, data)
         return sp.csr_array((data, ind, ptr), shape=(self.n_states, self.n_states))
 
     def regeneration(self, policy: np.ndarray, ref: int | None = None) -> RegenerativeLU:
-        """The policy's chain, cut at a state where it is often. Raises SingularChainError."""
+        """The LU of the policy's chain, cut at a state that it visits often. Raises SingularChainError."""
         ref = self.regeneration_state() if ref is None else ref
         if ref is None:
             raise SingularChainError("several closed classes")
@@ -132,21 +134,21 @@ class BellmanProblem:
         return log_mean, kl, tilted
 
     def ending(self) -> BellmanProblem:
-        """On the one closed class, which the process ends in under policies with full support."""
+        """The problem on its one closed class, where the process ends under every policy with full support."""
         label, closed = self.classes
-        inside = np.flatnonzero(label == np.flatnonzero(closed)[0])
-        rows = (inside[:, None] * self.n_actions + np.arange(self.n_actions)).ravel()
-        p = sp.csr_array(self.transition[rows][:, inside])
-        start = np.full(len(inside), 1.0 / len(inside))
-        return BellmanProblem(self.states[inside], p, self.reward[inside], self.prior[inside], start, self.beta)
+        members = np.flatnonzero(label == np.flatnonzero(closed)[0])
+        rows = (members[:, None] * self.n_actions + np.arange(self.n_actions)).ravel()
+        p = sp.csr_array(self.transition[rows][:, members])
+        start = np.full(len(members), 1.0 / len(members))
+        return BellmanProblem(self.states[members], p, self.reward[members], self.prior[members], start, self.beta)
 
     def regeneration_state(self) -> int | None:
-        """A likely start in the only closed class, or None if there are several."""
+        """The most likely first state in the only closed class; None where there are several classes."""
         label, closed = self.classes
         if closed.sum() != 1:
             return None
-        inside = np.flatnonzero(label == np.flatnonzero(closed)[0])
-        return int(inside[np.argmax(self.start[inside])])
+        members = np.flatnonzero(label == np.flatnonzero(closed)[0])
+        return int(members[np.argmax(self.start[members])])
 
 
 def state_graph(transition: sp.csr_array, n_actions: int) -> sp.csr_array:

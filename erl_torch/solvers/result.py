@@ -1,11 +1,12 @@
-"""From a value to a Solution with its certificate."""
+"""Turn a value into a Solution with its certificate."""
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 
 from erl_torch.mdp.tabular import check_policy
 from erl_torch.solution import Solution, Status
@@ -14,7 +15,7 @@ from erl_torch.solvers.problem import BellmanProblem
 
 
 class Sized(Protocol):
-    """An MDP as far as its answer is concerned."""
+    """The sizes of an MDP, which are all that a Solution needs of it."""
 
     @property
     def n_states(self) -> int: ...
@@ -30,13 +31,13 @@ def exact_solution(
     status: Status,
     n_steps: int,
     bounds: tuple[float, float],
-    prior_policy: Any = None,
+    prior_policy: ArrayLike | None = None,
     message: str = "",
     k: int | None = None,
 ) -> Solution:
-    """The solution that ``value`` [n] (on the problem's states) stands for; theta is the middle of the bounds.
+    """The solution that belongs to ``value`` [n], on the problem's states; theta is the middle of the bounds.
 
-    REDUCIBLE: theta* may differ from state to state, so none is given; the bounds hold for each.
+    With status REDUCIBLE, theta* may differ from state to state: there is no theta, and the bounds hold for each.
     """
     beta = problem.beta
     q = problem.action_value(value)
@@ -83,9 +84,9 @@ def bias(problem: BellmanProblem, log_psi: np.ndarray) -> np.ndarray:
 def policy_gap(
     problem: BellmanProblem, policy: np.ndarray, bounds: tuple[float, float], value: np.ndarray | None = None
 ) -> float:
-    """Upper bound on g* - J(policy) from the start, reward a step, for bounds on theta* = -g*.
+    """Upper bound on g* - J(policy) from the start, reward per step, for ``bounds`` on theta* = -g*.
 
-    ``value`` [n]: of which the policy is greedy, if it is; its gains then bound J closely enough.
+    ``value`` [n]: the value that the policy is pi_V of, if it is; its gains then bound J closely enough.
     """
     parts = (problem.transition, problem.reward, problem.prior, problem.beta, policy)
     worth = -np.inf
@@ -96,8 +97,8 @@ def policy_gap(
     return max(float(np.nextafter(-bounds[0] - worth, np.inf)), 0.0)
 
 
-def reducible_solution(mdp: Sized, problem: BellmanProblem, prior_policy: Any) -> Solution:
-    """The best policy and bounds that V = 0 proves, and a message that names the classes."""
+def reducible_solution(mdp: Sized, problem: BellmanProblem, prior_policy: ArrayLike | None) -> Solution:
+    """The policy and the bounds that V = 0 proves, and a message that names the classes."""
     value = np.zeros(problem.n_states)
     bounds = problem.gains(value).theta_bounds
     message = explain_classes(problem)
@@ -112,10 +113,10 @@ def ended(
     tol: float,
     steps: int,
     max_steps: int,
-    prior_policy: Any = None,
+    prior_policy: ArrayLike | None = None,
     k: int | None = None,
 ) -> Solution:
-    """The solution of an iteration that has stopped at ``value`` [n] with these bounds on theta*."""
+    """The solution of an iteration that stopped at ``value`` [n], with its status; ``bounds`` are on theta*."""
     message = ""
     if problem.is_narrow(bounds, tol, problem.gains(value).policy):
         status = Status.CONVERGED
@@ -129,12 +130,12 @@ def ended(
 
 
 def explain_classes(problem: BellmanProblem) -> str:
-    """Why the states that the start leads to are no single recurrent class, and what to do."""
+    """A text: why the states that the start leads to are not one recurrent class, and what to do."""
     label, closed = problem.classes
 
     def name(c: int) -> str:
-        inside = problem.states[label == c]
-        return f"{inside[:5].tolist()}{'...' if len(inside) > 5 else ''}"
+        members = problem.states[label == c]
+        return f"{members[:5].tolist()}{'...' if len(members) > 5 else ''}"
 
     ends = [name(c) for c in np.flatnonzero(closed)[:5]]
     if closed.sum() > 1:
@@ -150,7 +151,7 @@ def explain_classes(problem: BellmanProblem) -> str:
 
 
 def spread(problem: BellmanProblem, table: np.ndarray, elsewhere: np.ndarray) -> torch.Tensor:
-    """A table on the problem's states as one on all states."""
+    """``table`` on the problem's states, extended to all states by that of ``elsewhere``."""
     full = elsewhere.copy()
     full[problem.states] = table
     return torch.from_numpy(full)

@@ -4,22 +4,22 @@ T is convex and monotone and its derivative is the chain of the policy pi_V, so 
 that chain, is soft policy iteration: J never falls, and the error squares near the solution.
 
 Far from the solution the chain of pi_V may have sets that are all but closed, which double precision cannot tell from
-closed. So the horizon is made to grow: with lambda = 1 - 1/horizon
+closed ones. So the solver begins with a short horizon and lets it grow. With lambda = 1 - 1/horizon
 
     V + g = (1/beta) log sum_a prior exp(beta (r + lambda E V)),    V(ref) = 0
 
 is the discounted problem in relative form, where Newton's matrix I - lambda K is well conditioned whatever the chain.
-Each horizon starts from the value of the one before. As soon as the certificate of the undiscounted problem (which
-every V carries) shows that the solution is near, undiscounted steps finish; where they fail, the horizon grows on.
+Each horizon starts from the value of the one before. Every V also carries a certificate of the undiscounted problem.
+As soon as that shows that the solution is near, undiscounted steps finish; where they fail, the horizon grows on.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from erl_torch import checks
 from erl_torch.mdp.tabular import TabularMDP, check_policy
@@ -33,13 +33,13 @@ FIRST_HORIZON = 300.0  # steps
 GROWTH = 100.0
 LAST_HORIZON = 1e13
 POLISHING_STEPS = 5
-LOOSE = 0.1  # residual, relative to the reward range, at which the horizon grows
-NEAR = 0.3  # width of the undiscounted bounds, relative to the reward range, at which discounting may end
+FIRST_RESIDUAL = 0.1  # relative to the reward range, at which the horizon grows; lower after each undiscounted try
+UNDISCOUNTED_WIDTH = 0.3  # of the undiscounted bounds, relative to the reward range, at which discounting may end
 
 
 @dataclass(frozen=True, eq=False)
 class BellmanState:
-    """A value and what it proves."""
+    """A value and the bounds that it proves."""
 
     step: int  # linear systems solved
     horizon: float  # infinite once undiscounted
@@ -54,7 +54,7 @@ class BellmanState:
 
 
 def solve_soft_bellman(
-    mdp: TabularMDP, beta: float, prior_policy: Any = None, tol: float = 1e-10, max_steps: int = 200
+    mdp: TabularMDP, beta: float, prior_policy: ArrayLike | None = None, tol: float = 1e-10, max_steps: int = 200
 ) -> Solution:
     """The optimal entropy-regularised policy of ``mdp``, with two-sided bounds on theta*.
 
@@ -62,8 +62,8 @@ def solve_soft_bellman(
         mdp: the problem, on the states that its start leads to.
         beta: inverse temperature, 1/reward, > 0.
         prior_policy: [S, A], entries > 0; None is uniform.
-        tol: width of the bounds to stop at, relative to max(|theta|, mean |r| that the policy meets in the long run)
-            or, where that is less, the range of the rewards.
+        tol: width of the bounds at which to stop, relative to max(|theta|, mean |r| that the policy meets in the long
+            run) or, where that is less, the range of the rewards.
         max_steps: linear systems at most.
 
     Returns:
@@ -79,9 +79,9 @@ def solve_soft_bellman(
 
 
 def solve_problem(
-    problem: BellmanProblem, mdp: Sized, prior_policy: Any = None, tol: float = 1e-10, max_steps: int = 200
+    problem: BellmanProblem, mdp: Sized, prior_policy: ArrayLike | None = None, tol: float = 1e-10, max_steps: int = 200
 ) -> Solution:
-    """As ``solve_soft_bellman``, for a problem on part of the states of ``mdp``, of which only the sizes count."""
+    """As ``solve_soft_bellman``, for a problem on some states of ``mdp``, whose sizes alone count."""
     checks.positive("tol", tol)
     checks.at_least("max_steps", max_steps, 1)
     ref = problem.regeneration_state()
@@ -99,15 +99,20 @@ def solve_problem(
 
 
 def certify(
-    solution: Solution, mdp: TabularMDP, beta: float, prior_policy: Any = None, best: Solution | None = None
+    solution: Solution,
+    mdp: TabularMDP,
+    beta: float,
+    prior_policy: ArrayLike | None = None,
+    best: Solution | None = None,
 ) -> Solution:
-    """``solution``, learnt by whatever means, with the ``theta_bounds`` of ``mdp`` and its policy's own ``gap``.
+    """``solution``, however it was learnt, with the ``theta_bounds`` of ``mdp`` and the ``gap`` of its own policy.
 
-    Solves the model, unless ``best`` is its ``solve_soft_bellman`` already: the bounds are those, the gap is the upper
-    end on g* less the lower end on J(policy) from the start (``certificates.objective``).
+    The bounds are those of ``best``, the ``solve_soft_bellman`` of the model; None solves the model now. The gap is the
+    upper bound on g* less the lower bound on J(policy) from the start (``certificates.objective``).
     """
-    for key, one in (("solution", solution), *([] if best is None else [("best", best)])):
-        checks.instance(key, one, Solution, "a Solution")
+    checks.instance("solution", solution, Solution, "a Solution")
+    if best is not None:
+        checks.instance("best", best, Solution, "a Solution")
     problem = BellmanProblem.of(mdp, beta, prior_policy)
     bounds = (best or solve_soft_bellman(mdp, beta, prior_policy)).theta_bounds
     assert bounds is not None
@@ -123,36 +128,36 @@ def iterate_soft_bellman(problem: BellmanProblem, ref: int, tol: float, max_step
 
     state = _state(problem, np.zeros(problem.n_states), 0, 0.0)
     yield state
-    horizon, loose, home = FIRST_HORIZON, LOOSE, ref
+    horizon, residual, home = FIRST_HORIZON, FIRST_RESIDUAL, ref
     while not done(state) and state.step < max_steps and horizon <= LAST_HORIZON:
         discount = 1 - 1 / horizon
         for once in range(50):
             backed_up, policy = soft_backup(problem.action_value(discount * state.value), problem.prior, problem.beta)
             error = backed_up - state.value
-            if state.step >= max_steps or (once and np.ptp(error) <= loose * problem.reward_range):
+            if state.step >= max_steps or (once and np.ptp(error) <= residual * problem.reward_range):
                 break
             lu = RegenerativeLU(problem.chain(policy), home, discount, problem.elimination)
             state = _state(problem, state.value + lu.poisson(error, refine=False)[1], state.step + 1, horizon)
-            # Where the process spends its time within the horizon: a state to come back to.
+            # Within the horizon the process spends most time here: it comes back to this state.
             ref = int(np.argmax(lu.stationary()))
             yield state
             if done(state):
                 return
-        if state.width < NEAR * problem.reward_range or horizon > 1e6:
+        if state.width < UNDISCOUNTED_WIDTH * problem.reward_range or horizon > 1e6:
             best, steps = state, state.step
             for new in _undiscounted(problem, state, ref, done, max_steps):
                 yield new
                 steps = new.step
                 best = new if new.width < best.width else best
             state = replace(best, step=steps)
-            loose *= 0.1
+            residual *= 0.1
         horizon *= GROWTH
 
 
 def polish(
     problem: BellmanProblem, value: np.ndarray, bounds: tuple[float, float], tol: float
 ) -> tuple[np.ndarray, tuple[float, float]]:
-    """(value [n], bounds on theta*) after Newton steps from a value whose own rounding keeps ``bounds`` apart."""
+    """(value [n], bounds on theta*) after Newton steps from a value whose rounding keeps ``bounds`` apart."""
     ref = problem.regeneration_state()
     state = _state(problem, value, 0, np.inf)
     if ref is None or problem.is_narrow(bounds, tol, state.policy):
@@ -178,7 +183,7 @@ def _undiscounted(
         if len(widths) > 3 and min(widths[-3:]) > 0.5 * min(widths[:-3]):
             return
         new = _newton(problem, state, lu) if lu else None
-        # The factors of an earlier step will do where they still gain two digits.
+        # Keep the factors of an earlier step while they still gain two digits.
         if new is None or not new.width < 0.01 * state.width:
             try:
                 lu = problem.regeneration(state.policy, ref)
@@ -199,5 +204,5 @@ def _newton(problem: BellmanProblem, state: BellmanState, lu: RegenerativeLU) ->
 
 
 def _state(problem: BellmanProblem, value: np.ndarray, step: int, horizon: float) -> BellmanState:
-    found = problem.gains(value)
-    return BellmanState(step, horizon, value, found.gain, found.policy, found.theta_bounds)
+    gains = problem.gains(value)
+    return BellmanState(step, horizon, value, gains.gain, gains.policy, gains.theta_bounds)
