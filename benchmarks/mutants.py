@@ -980,7 +980,7 @@ MUTANTS = [
         "the probability of ending in a class is left out",
         "solvers/chains.py",
         "share[members] = mass * own.of_state",
-        "share[inside] = part.of_state / len(ends)",
+        "share[members] = own.of_state / len(ends)",
         "test_rounding.py::test_endings_of_a_chain_with_several_classes",
     ),
     Mutant(
@@ -1489,7 +1489,7 @@ MUTANTS = [
         "a gap is of the optimum's states",
         "solvers/optimum.py",
         "max(_mean(own, loss), 0.0) / beta",
-        "max(_mean(best.stationary, loss), 0.0) / beta",
+        "max(_mean(optimum.stationary, loss), 0.0) / beta",
         "test_comparison.py::test_measures_are_their_definitions",
     ),
     Mutant(
