@@ -1389,7 +1389,7 @@ MUTANTS = [
     Mutant(
         "a box's distribution is big-endian",
         "envs/discretise.py",
-        "np.outer(one, p).ravel()",
+        "np.outer(marginal, p).ravel()",
         "np.outer(p, one).ravel()",
         "test_discretise.py::test_distribution_of_a_box",
     ),
@@ -1445,7 +1445,7 @@ MUTANTS = [
     Mutant(
         "traps stand beside the start",
         "envs/mazes.py",
-        "near[row - 1 : row + 2, col - 1 : col + 2] = True",
+        "kept[row - 1 : row + 2, col - 1 : col + 2] = True",
         "near[row - 1 : row + 2, col - 1 : col + 1] = True",
         "test_mazes.py",
     ),

@@ -71,6 +71,11 @@ def number(key: str, value: object, fits: Callable[[float], bool], allowed: str)
     raise InputError(key, value, allowed)
 
 
+def finite(key: str, value: object) -> float:
+    """``value`` as a float. Raises InputError unless it is a finite number."""
+    return number(key, value, math.isfinite, "a finite number")
+
+
 def positive(key: str, value: object) -> float:
     """``value`` as a float. Raises InputError unless it is a finite number > 0."""
     return number(key, value, lambda x: 0 < x < math.inf, "a finite number > 0")

@@ -64,8 +64,8 @@ class Solution:
     u: torch.Tensor  # [S, A] > 0, mean 1; 0 or infinite beyond double precision, where ``log_u`` is not
     psi: torch.Tensor  # [S] > 0, 1 / sum_a prior(a|s) u(s,a); likewise, ``log_psi``
     rho: float | None = None
-    theta: float | None = None  # reward a step; -theta is the regularised reward rate
-    reward_bias: torch.Tensor  # [S, A] >= 0, reward a step
+    theta: float | None = None  # reward per step; -theta is the regularised reward rate
+    reward_bias: torch.Tensor  # [S, A] >= 0, reward per step
     reward_bias_max: float
     n_steps: int  # tuples that the u updates used, all epochs together
     status: Status
@@ -75,7 +75,7 @@ class Solution:
     value: torch.Tensor | None = None  # V(s), [S], reward, up to a constant; exact solvers
     action_value: torch.Tensor | None = None  # Q(s,a), [S, A], with the same constant
     theta_bounds: tuple[float, float] | None = None  # two-sided, on theta*; where the model is known
-    gap: float | None = None  # at least -theta* - J(policy), reward a step; where the model is known
+    gap: float | None = None  # at least -theta* - J(policy), reward per step; where the model is known
     k: int | None = None  # biasing iterations as the paper's Table S1 counts them
 
     @property

@@ -84,7 +84,7 @@ class Estimate:
     where it is lopsided."""
 
     name: str
-    value: float  # reward a step
+    value: float  # reward per step
     standard_error: float
     samples: np.ndarray | None = None  # of the bootstrap, [n]
     variance: np.ndarray | None = None  # what each pair adds to standard_error^2, [S, A]; plug-in

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -92,26 +91,17 @@ class DiscreteAcrobotEnv(ControlEnv):
     All four uniform in +-0.1.
 
     ## Rewards
-    -1 a step, 0 for the one that reaches the line.
+    -1 per step, 0 for the one that reaches the line.
 
     ## Episode End
     Terminates when -cos(angle 1) - cos(angle 1 + angle 2) > 1. The registered environment truncates after 500 steps.
 
     ## Arguments
-    `bins` (12, or one number a variable), `low`, `high` (+-pi, +-pi, +-4 pi, +-9 pi), `torques` (-1, 0, 1),
+    `bins` (12, or one number per variable), `low`, `high` (+-pi, +-pi, +-4 pi, +-9 pi), `torques` (-1, 0, 1),
     `reward` ("original" or "cyclic", here the same), `render_mode` ("human" or "rgb_array").
 
     ## Version History
     v0: the setting of the paper's Table S2.
     """
 
-    def __init__(
-        self,
-        bins: int | Sequence[int] | None = None,
-        low: Sequence[float] | None = None,
-        high: Sequence[float] | None = None,
-        torques: Sequence[float] | None = None,
-        reward: str = "original",
-        render_mode: str | None = None,
-    ) -> None:
-        super().__init__(TASK, bins, low, high, torques, reward, render_mode)
+    task = TASK

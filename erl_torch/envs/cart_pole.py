@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import torch
 
-from erl_torch.envs.control import ControlEnv, ControlTask, Step
+from erl_torch.envs.control import ControlTask, FixedActionsEnv, Step
 
 GRAVITY, MASS_POLE, MASS, HALF_LENGTH, FORCE, DT = 9.8, 0.1, 1.1, 0.5, 10.0, 0.02
 MAX_POSITION, MAX_ANGLE = 2.4, math.radians(12)
@@ -44,7 +43,7 @@ TASK = ControlTask(
 )
 
 
-class DiscreteCartPoleEnv(ControlEnv):
+class DiscreteCartPoleEnv(FixedActionsEnv):
     """Balance a pole on a cart; positions and velocities are binned.
 
     ## Description
@@ -60,26 +59,18 @@ class DiscreteCartPoleEnv(ControlEnv):
     All four uniform in +-0.05.
 
     ## Rewards
-    1 a step, also for the step that fails. With `reward="cyclic"` 0 a step and -1 for that one.
+    1 per step, also for the step that fails. With `reward="cyclic"` 0 per step and -1 for that one.
 
     ## Episode End
     Terminates when the position leaves +-2.4 or the angle +-12 degrees. The registered environment truncates after
     500 steps.
 
     ## Arguments
-    `bins` (8, or one number a variable), `low`, `high` (+-2.5, +-3.5, +-0.25, +-2.5), `reward` ("original" or
+    `bins` (8, or one number per variable), `low`, `high` (+-2.5, +-3.5, +-0.25, +-2.5), `reward` ("original" or
     "cyclic"), `render_mode` ("human" or "rgb_array").
 
     ## Version History
     v0: the setting of the paper's Table S2.
     """
 
-    def __init__(
-        self,
-        bins: int | Sequence[int] | None = None,
-        low: Sequence[float] | None = None,
-        high: Sequence[float] | None = None,
-        reward: str = "original",
-        render_mode: str | None = None,
-    ) -> None:
-        super().__init__(TASK, bins, low, high, None, reward, render_mode)
+    task = TASK

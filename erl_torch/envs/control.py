@@ -1,11 +1,11 @@
-"""Classic control with binned states: what the tasks share.
+"""Classic control with binned states: the code that the tasks share.
 
 A ``ControlTask`` holds the dynamics of one of Gymnasium's environments as pure functions over tensors, so that many
-states step at once on any device. ``ControlEnv`` is the same task with Discrete spaces over Gymnasium's own
-environment. ``erl_torch.envs.estimate`` turns a task into a TabularMDP, ``erl_torch.experience.rollouts`` plays
-episodes in the original dynamics.
+states step at once on any device. ``ControlEnv`` wraps Gymnasium's own environment of the task in Discrete spaces.
+``erl_torch.envs.estimate`` turns a task into a TabularMDP, ``erl_torch.experience.rollouts`` plays episodes in the
+original dynamics.
 
-A state tensor is [N, d]; columns are best contiguous (``torch.stack(columns).T``). All is float64.
+A state tensor is [N, d], float64; contiguous columns (``torch.stack(columns).T``) are the fastest.
 """
 
 from __future__ import annotations
@@ -14,11 +14,12 @@ import importlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 import torch
+from gymnasium.core import RenderFrame
 
 from erl_torch import checks
 from erl_torch.checks import InputError
@@ -29,7 +30,7 @@ REWARDS = ("original", "cyclic")
 
 
 class Step(NamedTuple):
-    """What one step makes of N states."""
+    """The outcome of one step from each of N states."""
 
     state: torch.Tensor  # [N, d]
     reward: torch.Tensor  # [N], Gymnasium's
@@ -45,15 +46,15 @@ class ControlTask:
         gymnasium_id: the original.
         bins, low, high: default bins of ``variables``.
         actions: default values of the actions.
-        max_action: the largest |value| that the original takes; None where its actions cannot be changed.
+        max_action: the largest |value| that the original takes; None where its actions are fixed.
         beta: inverse temperature in the paper's Table S2.
         reset_low, reset_high: the first state is uniform in this box.
         step: (states [N, d], action values [N]) -> Step, equal to the original's ``env.step``.
-        instant_reward: (states [N, d], their Step) -> reward [N] of the paper's model, where nothing ends.
+        instant_reward: (states [N, d], their Step) -> reward [N] of the paper's model, which has no episodes.
         variables: states [N, d] -> the variables that are binned, [N, d].
-        features: one observation of the original -> these variables, [d]; None where they are equal.
+        features: one observation of the original -> the variables that are binned, [d]; None where they are the same.
         reset_dtype: precision in which the original draws its first state.
-        max_reward: the original's largest reward of a step.
+        max_reward: the largest reward of a step in the original.
     """
 
     name: str
@@ -84,19 +85,20 @@ class ControlTask:
         low: Sequence[float] | None = None,
         high: Sequence[float] | None = None,
     ) -> UniformBins:
-        """The bins asked for; None is the task's own. Raises InputError as ``UniformBins`` does."""
-        sizes: Any = [bins] * len(self.bins) if bins is not None and np.ndim(bins) == 0 else bins
-        parts = (
-            self.bins if sizes is None else checks.sequence("bins", sizes),
-            self.low if low is None else tuple(checks.array("low", low, (len(self.bins),)).tolist()),
-            self.high if high is None else tuple(checks.array("high", high, (len(self.bins),)).tolist()),
+        """Bins of these numbers and bounds; None is the task's own. Raises InputError as ``UniformBins`` does."""
+        d = len(self.bins)
+        numbers = [bins] * d if bins is not None and np.ndim(bins) == 0 else bins
+        sizes = self.bins if numbers is None else checks.sequence("bins", numbers)
+        first, last = (
+            own if given is None else tuple(checks.array(key, given, (d,)).tolist())
+            for key, given, own in (("low", low, self.low), ("high", high, self.high))
         )
-        if len(parts[0]) != len(self.bins):
-            raise InputError("bins", list(parts[0]), f"a whole number or {len(self.bins)} of them")
-        return UniformBins(*parts)
+        if len(sizes) != d:
+            raise InputError("bins", list(sizes), f"a whole number or {d} of them")
+        return UniformBins(sizes, first, last)
 
     def action_values(self, actions: Sequence[float] | None = None) -> tuple[float, ...]:
-        """The values asked for; None is the task's own. Raises InputError for values the original refuses."""
+        """``actions`` as floats; None is the task's own. Raises InputError for values that the original refuses."""
         if actions is None:
             return self.actions
         if self.max_action is None:
@@ -114,8 +116,8 @@ def control_task(task: str | ControlTask) -> ControlTask:
     if isinstance(task, ControlTask):
         return task
     checks.one_of("task", task, tuple(CONTROL_TASKS))
-    found: ControlTask = importlib.import_module(f"erl_torch.envs.{task}").TASK
-    return found
+    named: ControlTask = importlib.import_module(f"erl_torch.envs.{task}").TASK
+    return named
 
 
 def wrap(angle: torch.Tensor) -> torch.Tensor:
@@ -124,35 +126,38 @@ def wrap(angle: torch.Tensor) -> torch.Tensor:
 
 
 class ControlEnv(gym.Env[np.int64, np.int64]):
-    """A control task with Discrete spaces: the original steps, its state is binned.
+    """A control task with Discrete spaces. The original environment steps; its state is binned.
 
     Args:
-        task: the task.
-        bins, low, high, actions: as in ``erl_torch.estimate_mdp``.
-        reward: "original", or "cyclic": 0 for the step that terminates, all less the largest reward, so at most 0.
-            Learn from that one: some originals pay the same for every step, so that a stream of episodes would not
-            tell short from long.
-        render_mode: the original's.
+        bins, low, high: as in ``erl_torch.estimate_mdp``.
+        torques: values of the actions, ``actions`` of ``erl_torch.estimate_mdp``.
+        reward: "original", or "cyclic": the largest reward is subtracted, after the step that terminates got 0; so all
+            are at most 0. Learn from the cyclic one: some originals pay the same for every step, so that a stream of
+            episodes would not tell short episodes from long ones.
+        render_mode: one of the original's, or None.
+
+    Raises:
+        InputError: an argument out of range.
     """
 
+    task: ClassVar[ControlTask]
     metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 30}  # noqa: RUF012
 
     def __init__(
         self,
-        task: ControlTask,
         bins: int | Sequence[int] | None = None,
         low: Sequence[float] | None = None,
         high: Sequence[float] | None = None,
-        actions: Sequence[float] | None = None,
+        torques: Sequence[float] | None = None,
         reward: str = "original",
         render_mode: str | None = None,
     ) -> None:
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise InputError("render_mode", render_mode, " or ".join(self.metadata["render_modes"]))
         checks.one_of("reward", reward, REWARDS)
-        self.task, self.reward, self.render_mode = task, reward, render_mode
+        task, self.reward, self.render_mode = self.task, reward, render_mode
         self.bins = task.uniform_bins(bins, low, high)
-        self.actions = task.action_values(actions)
+        self.actions = task.action_values(torques)
         original = gym.make(task.gymnasium_id, render_mode=render_mode).unwrapped  # without its time limit
         self.metadata = original.metadata
         values = list(self.actions) if isinstance(original.action_space, gym.spaces.Box) else None
@@ -176,8 +181,22 @@ class ControlEnv(gym.Env[np.int64, np.int64]):
             reward = (0.0 if terminated else reward) - self.task.max_reward
         return cell, reward, terminated, truncated, info
 
-    def render(self) -> Any:
+    def render(self) -> RenderFrame | list[RenderFrame] | None:
         return self.env.render()
 
     def close(self) -> None:
         self.env.close()
+
+
+class FixedActionsEnv(ControlEnv):
+    """A ``ControlEnv`` of a task whose actions are fixed; ``Args`` and ``Raises`` as there."""
+
+    def __init__(
+        self,
+        bins: int | Sequence[int] | None = None,
+        low: Sequence[float] | None = None,
+        high: Sequence[float] | None = None,
+        reward: str = "original",
+        render_mode: str | None = None,
+    ) -> None:
+        super().__init__(bins, low, high, None, reward, render_mode)

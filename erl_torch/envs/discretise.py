@@ -1,4 +1,4 @@
-"""Uniform bins: real vectors to whole numbers, and any Gymnasium environment with them.
+"""Uniform bins, which turn real vectors into whole numbers, and any Gymnasium environment with them.
 
 Dimension i of [low_i, high_i] is cut into bins_i equal parts, numbered from 0; values outside fall into the end bins.
 Cell number, little-endian: sum_i x_i prod(bins[:i]).
@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 
 import gymnasium as gym
 import numpy as np
+from numpy.typing import ArrayLike
 
 from erl_torch import checks
 from erl_torch.checks import InputError
@@ -22,10 +23,13 @@ Array = TypeVar("Array")  # np.ndarray or torch.Tensor
 
 @dataclass(frozen=True)
 class UniformBins:
-    """Cells of a box. Raises InputError for lengths that differ, bins < 1, or bounds not finite and ascending.
+    """The cells of a box.
 
     Args:
-        bins, low, high: one entry a dimension.
+        bins, low, high: one entry per dimension.
+
+    Raises:
+        InputError: lengths that differ, bins < 1, or bounds that are not finite and ascending.
     """
 
     bins: tuple[int, ...]
@@ -35,14 +39,11 @@ class UniformBins:
     def __post_init__(self) -> None:
         if not len(self.bins) == len(self.low) == len(self.high) > 0:
             lengths = f"{len(self.bins)}, {len(self.low)} and {len(self.high)} entries"
-            raise InputError("bins, low, high", lengths, "of one length, one entry a dimension")
+            raise InputError("bins, low, high", lengths, "of one length, one entry per dimension")
         for i, (n, low, high) in enumerate(zip(self.bins, self.low, self.high, strict=True)):
-            if not (checks.is_number(n) or isinstance(n, np.integer)):
-                raise InputError(f"bins[{i}]", n, "a whole number >= 1")
             checks.at_least(f"bins[{i}]", n, 1)
-            for key, bound in (("low", low), ("high", high)):
-                if not (checks.is_number(bound) and math.isfinite(bound)):
-                    raise InputError(f"{key}[{i}]", bound, "a finite number")
+            checks.finite(f"low[{i}]", low)
+            checks.finite(f"high[{i}]", high)
             if not low < high:
                 raise InputError(f"high[{i}]", high, f"above low[{i}]={low}")
         object.__setattr__(self, "bins", tuple(map(int, self.bins)))
@@ -54,7 +55,7 @@ class UniformBins:
         return math.prod(self.bins)
 
     def cells(self, x: Array) -> Array:
-        """Cell numbers [N] int64 of points [N, d], array or tensor. Raises InputError for NaN or a wrong shape."""
+        """Cell numbers [N], int64, of points [N, d], array or tensor. Raises InputError for NaN or a wrong shape."""
         points: Any = x
         if points.ndim != 2 or points.shape[1] != len(self.bins):
             raise InputError("points", f"array of shape {tuple(points.shape)}", f"of shape [N, {len(self.bins)}]")
@@ -86,16 +87,19 @@ class UniformBins:
         return np.asarray((np.array(self.high) - np.array(self.low)) / np.array(self.bins))
 
     def box_distribution(self, low: Sequence[float], high: Sequence[float]) -> np.ndarray:
-        """[n_cells]: probability of every cell under the uniform distribution on the box [low, high] (or point)."""
+        """Probability of each cell, [n_cells], under the uniform distribution on the box [low, high].
+
+        Where low and high are equal, that dimension is a point.
+        """
         p = np.ones(1)
         for n, first, last, a, b in zip(self.bins, self.low, self.high, low, high, strict=True):
             if a == b:
-                one = np.zeros(n)
-                one[UniformBins((n,), (first,), (last,)).cells(np.array([[a]]))] = 1
+                marginal = np.zeros(n)
+                marginal[UniformBins((n,), (first,), (last,)).cells(np.array([[a]]))] = 1
             else:
                 inner = np.linspace(first, last, n + 1)[1:-1]
-                one = np.diff(np.clip((inner - a) / (b - a), 0, 1), prepend=0, append=1)
-            p = np.outer(one, p).ravel()
+                marginal = np.diff(np.clip((inner - a) / (b - a), 0, 1), prepend=0, append=1)
+            p = np.outer(marginal, p).ravel()
         return p
 
 
@@ -104,9 +108,10 @@ class Discretise(gym.Wrapper[np.int64, np.int64, Any, Any], gym.utils.RecordCons
 
     Args:
         env: the environment.
-        bins: bins of every dimension, or a list with one entry each.
-        low, high: bounds of the bins, a number or one a dimension; None takes those of the observation space.
-        actions: for Box actions only: a list of values (or vectors), or how many equally spaced ones a dimension.
+        bins: number of bins, or a list with one number per dimension.
+        low, high: bounds of the bins, a number or one per dimension; None takes those of the observation space.
+        actions: for Box actions only: a list of values (or vectors), or the number of equally spaced values in each
+            dimension.
         features: maps the observation to the variables that are binned; needs lists ``low`` and ``high``.
 
     Raises:
@@ -119,7 +124,7 @@ class Discretise(gym.Wrapper[np.int64, np.int64, Any, Any], gym.utils.RecordCons
         bins: int | Sequence[int],
         low: float | Sequence[float] | None = None,
         high: float | Sequence[float] | None = None,
-        actions: int | Sequence[Any] | None = None,
+        actions: int | Sequence[float] | Sequence[Sequence[float]] | None = None,
         features: Callable[[np.ndarray], np.ndarray] | None = None,
     ) -> None:
         gym.utils.RecordConstructorArgs.__init__(
@@ -131,7 +136,7 @@ class Discretise(gym.Wrapper[np.int64, np.int64, Any, Any], gym.utils.RecordCons
             raise InputError("observation_space", space, "a one-dimensional Box to be cut into bins")
         if features is None:
             dimensions = space.shape[0]
-            # The largest number of the dtype is a way to say that there is no bound.
+            # The largest number of the dtype stands for "no bound".
             bounded = np.isfinite(space.low) & np.isfinite(space.high)
             if space.dtype is not None and space.dtype.kind == "f":
                 bounded &= np.maximum(abs(space.low), abs(space.high)) < np.finfo(space.dtype).max
@@ -139,7 +144,7 @@ class Discretise(gym.Wrapper[np.int64, np.int64, Any, Any], gym.utils.RecordCons
             high = _bounds("high", high, space.high, bounded)
         else:
             if not (isinstance(low, Sequence) and isinstance(high, Sequence)):
-                raise InputError("low, high", f"{low}, {high}", "lists, one entry a variable that features gives")
+                raise InputError("low, high", f"{low}, {high}", "lists, one entry per variable that features gives")
             dimensions = len(low)
         self.features = features
         sizes = _each("bins", bins, dimensions)
@@ -160,25 +165,26 @@ class Discretise(gym.Wrapper[np.int64, np.int64, Any, Any], gym.utils.RecordCons
         observation, reward, terminated, truncated, info = self.env.step(self.actions[int(action)])
         return self._cell(observation), float(reward), terminated, truncated, info
 
-    def _cell(self, observation: Any) -> np.int64:
-        x = observation if self.features is None else self.features(observation)
+    def _cell(self, observation: ArrayLike) -> np.int64:
+        x = np.asarray(observation) if self.features is None else self.features(np.asarray(observation))
         cell: np.int64 = self.bins.cells(np.asarray(x, np.float64)[None])[0]
         return cell
 
 
-def _each(key: str, value: Any, dimensions: int) -> list[Any]:
-    """``value`` for every dimension."""
+def _each(key: str, value: object, dimensions: int) -> list[Any]:
+    """``value``, a number or a list, as a list with one entry per dimension."""
     if value is None:
-        raise InputError(key, value, "given: a number, or one a dimension")
+        raise InputError(key, value, "given: a number, or one per dimension")
     if checks.is_number(value):
         return [value] * dimensions
-    values = list(value)
+    values = list(checks.sequence(key, value))
     if len(values) != dimensions:
-        raise InputError(key, values, f"a number or {dimensions} numbers, one a dimension")
+        raise InputError(key, values, f"a number or {dimensions} numbers, one per dimension")
     return values
 
 
-def _bounds(key: str, value: Any, own: np.ndarray, bounded: np.ndarray) -> list[Any]:
+def _bounds(key: str, value: object, own: np.ndarray, bounded: np.ndarray) -> list[Any]:
+    """``value`` as a list; where it is None, the space's ``own`` bounds, which must all be ``bounded``."""
     if value is not None:
         return _each(key, value, len(own))
     if not bounded.all():
@@ -188,7 +194,7 @@ def _bounds(key: str, value: Any, own: np.ndarray, bounded: np.ndarray) -> list[
     return own.tolist()  # type: ignore[no-any-return]
 
 
-def _action_table(space: gym.Space[Any], actions: Any) -> np.ndarray:
+def _action_table(space: gym.Space[Any], actions: object) -> np.ndarray:
     """[A] whole numbers or [A, d] vectors, as the environment takes them."""
     if isinstance(space, gym.spaces.Discrete):
         if actions is not None:

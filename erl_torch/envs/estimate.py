@@ -1,12 +1,12 @@
-"""A control task as a finite MDP, by exhaustive sampling.
+"""Estimate the finite MDP of a control task, by exhaustive sampling.
 
-For every cell and action: ``n_samples`` states uniform in the cell take one step each; p(s'|s,a) is the share of them
-that lands in s', r(s,a) their mean instant reward, from which the largest r(s,a) of all is then subtracted. Nothing
+For every cell and action, ``n_samples`` states uniform in the cell take one step each. p(s'|s,a) is the share of them
+that lands in s', r(s,a) their mean instant reward. From all rewards the largest r(s,a) is then subtracted. No state
 restarts or absorbs.
 
-Random numbers are NumPy's, one SeedSequence child a chunk of (cell, action) rows, so that the model depends on the
-seed but not on the number of workers. Estimates are kept in the folder $ERL_TORCH_CACHE, or erl_torch in
-$XDG_CACHE_HOME or ~/.cache, under the hash of every setting behind them.
+Random numbers are NumPy's, one child of the SeedSequence per chunk of (cell, action) rows, so that the model depends
+on the seed but not on the number of workers. Estimates are kept in the folder $ERL_TORCH_CACHE, or erl_torch in
+$XDG_CACHE_HOME or ~/.cache, under the hash of all settings that determine them.
 """
 
 from __future__ import annotations
@@ -34,15 +34,15 @@ from erl_torch.envs.discretise import UniformBins
 from erl_torch.files import read_npz, write_npz
 from erl_torch.mdp.tabular import TabularMDP
 
-FORMAT = 2  # of the cache; goes up whenever the same settings give another model, so that none is used that is old
+FORMAT = 2  # of the cache; raise it whenever the same settings give another model, so that no old one is used
 CHUNK = 32_000  # samples at once: they fit a core's cache, and torch starts no threads for fewer than 32,768
-ROW_BYTES = 100  # of a cell and action, with a transition or two
-MOST_SAMPLES = 1_000_000  # a row, which is the least that a chunk holds
+ROW_BYTES = 100  # of one cell and action, with a transition or two
+MOST_SAMPLES = 1_000_000  # of one row; a chunk holds at least one row
 STARTS = ("reset", "uniform")
 
 
 class EstimatedModel(NamedTuple):
-    """``mdp.reward + reward_shift`` is the mean instant reward that was sampled."""
+    """An MDP and its ``reward_shift``: ``mdp.reward + reward_shift`` is the mean of the sampled instant rewards."""
 
     mdp: TabularMDP
     reward_shift: float
@@ -67,17 +67,17 @@ def estimate_mdp(
 
     Args:
         task: "pendulum", "mountain_car", "cart_pole", "acrobot", or a task of one's own.
-        bins: bins of every variable, or one number each; None is the task's own, as for ``low``, ``high``, ``actions``.
-        low, high: bounds of the bins, one number a variable.
-        actions: values of the actions (torques), where the original leaves a choice.
+        bins: number of bins, or one per variable; None is the task's own, as for ``low``, ``high`` and ``actions``.
+        low, high: bounds of the bins, one number per variable.
+        actions: values of the actions (torques), where the original lets one choose.
         n_samples: samples of each (cell, action), 1 to 1,000,000.
         seed: a whole number >= 0.
-        start: first state as the original draws it ("reset", exact probabilities), or any cell ("uniform").
+        start: the first state is drawn as in the original ("reset", exact probabilities), or is any cell ("uniform").
         device: torch device that the dynamics run on. Models of two kinds of device may differ by rounding.
-        workers: threads; None is one a core. The model does not depend on it.
+        workers: threads; None is one per core. The model does not depend on it.
         cache: read and write the disk cache.
         report: called with the number of samples done, now and then, by the calling thread.
-        progress: show a bar, on a terminal, if it takes longer than two seconds.
+        progress: show a bar, on a terminal, if the work takes longer than two seconds.
 
     Raises:
         InputError: a setting out of range.
@@ -123,7 +123,7 @@ class _Counts(NamedTuple):
 
 @dataclass(frozen=True)
 class _Job:
-    """Settings that determine an estimate."""
+    """The settings that determine an estimate."""
 
     task: ControlTask
     space: UniformBins
@@ -140,15 +140,15 @@ class _Job:
         """Sample every row, ``workers`` chunks at a time."""
         step = max(1, CHUNK // self.n_samples)
         chunks = [(i, b, min(b + step, self.n_rows)) for i, b in enumerate(range(0, self.n_rows, step))]
-        parts = []
+        sampled = []
         with ThreadPoolExecutor(workers) as pool:
             try:
-                for part, (_, _, end) in zip(pool.map(lambda c: self._sample(*c), chunks), chunks, strict=True):
-                    parts.append(part)
+                for rows, (_, _, end) in zip(pool.map(lambda c: self._sample(*c), chunks), chunks, strict=True):
+                    sampled.append(rows)
                     report(end * self.n_samples)
             finally:
                 pool.shutdown(cancel_futures=True)
-        length, indices, counts, reward = (np.concatenate(column) for column in zip(*parts, strict=True))
+        length, indices, counts, reward = (np.concatenate(column) for column in zip(*sampled, strict=True))
         return _Counts(np.concatenate([[0], np.cumsum(length)]), indices, counts, reward)
 
     def _sample(self, chunk: int, begin: int, end: int) -> tuple[np.ndarray, ...]:
@@ -179,7 +179,7 @@ class _Job:
 
     @cached_property
     def key(self) -> str:
-        """Every setting that matters, as JSON."""
+        """All settings of the estimate, as JSON."""
         space = self.space
         settings = {
             "format": FORMAT,
@@ -200,24 +200,24 @@ class _Job:
         return cache_folder() / f"{self.task.name}-{digest}.npz"
 
     def cached(self) -> _Counts | None:
-        """What the cache holds, or None. A file that is not what it should be gives a warning."""
+        """The counts in the cache; None where it has none. A damaged or foreign file gives a warning."""
         if not self.path.exists():
             return None
         try:
             arrays: dict[str, Any] = read_npz(self.path)
-            found = _Counts(*(arrays[name] for name in _Counts._fields))
-            if arrays["key"].item() != self.key or not self._plausible(found):
-                raise ValueError("it is of other settings, or its parts do not fit together")
-            return found
+            sampled = _Counts(*(arrays[name] for name in _Counts._fields))
+            if arrays["key"].item() != self.key or not self._plausible(sampled):
+                raise ValueError("it is of other settings, or its arrays do not fit together")
+            return sampled
         except (KeyError, ValueError) as error:
             warnings.warn(f"estimating {self.task.name} anew, as {self.path} is unusable: {error}", stacklevel=3)
             return None
 
-    def _plausible(self, found: _Counts) -> bool:
-        indptr, indices, counts, reward = found
+    def _plausible(self, sampled: _Counts) -> bool:
+        indptr, indices, counts, reward = sampled
         return (
-            [x.dtype.kind for x in found] == ["i", "i", "i", "f"]
-            and [x.ndim for x in found] == [1] * 4
+            [x.dtype.kind for x in sampled] == ["i", "i", "i", "f"]
+            and [x.ndim for x in sampled] == [1] * 4
             and len(indptr) == self.n_rows + 1 == len(reward) + 1
             and indptr[0] == 0
             and len(indices) == len(counts) == indptr[-1]
@@ -228,7 +228,7 @@ class _Job:
         )
 
     def keep(self, sampled: _Counts) -> None:
-        """Write the cache file, if that is possible."""
+        """Write the cache file; where that fails, warn."""
         try:
             write_npz(self.path, {"key": self.key, **sampled._asdict()})
         except OSError as error:
@@ -236,7 +236,7 @@ class _Job:
 
 
 def cache_folder() -> Path:
-    """Where estimates are kept."""
+    """The folder of the cache."""
     own = os.environ.get("ERL_TORCH_CACHE")
     if own:
         return Path(own)

@@ -1,10 +1,9 @@
-"""Windy frozen lakes: teaching maps by name, or rows of tiles of one's own."""
+"""Windy frozen lakes: maps for teaching, by name, or rows of tiles of one's own."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -30,12 +29,13 @@ MAPS = {
 }  # fmt: skip
 
 
-def _lake(desc: str | Sequence[str], wind: Any, **rules: Any) -> GridWorld:
-    if isinstance(desc, str):
-        if desc not in MAPS:
-            raise InputError("desc", desc, f"rows of tiles or a map: {', '.join(sorted(MAPS))}")
-        desc = MAPS[desc]
-    return GridWorld(tuple(desc), wind, **rules)
+def _tiles(desc: str | Sequence[str]) -> tuple[str, ...]:
+    """Rows of tiles; a text is the name of a map."""
+    if not isinstance(desc, str):
+        return tuple(desc)
+    if desc not in MAPS:
+        raise InputError("desc", desc, f"rows of tiles or a map: {', '.join(sorted(MAPS))}")
+    return MAPS[desc]
 
 
 def windy_frozen_lake(
@@ -56,14 +56,9 @@ def windy_frozen_lake(
     Raises:
         InputError: as ``GridWorld``, or an unknown map.
     """
-    return _lake(
-        desc,
-        wind,
-        trap_reward=trap_reward,
-        n_actions=n_actions,
-        action_success_prob=action_success_prob,
-        tile_rewards=tile_rewards or {},
-    ).mdp()
+    rules = dict(tile_rewards or {})
+    field = uniform_wind(0.0, 0.0) if wind is None else wind
+    return GridWorld(_tiles(desc), field, trap_reward, action_success_prob, n_actions, tile_rewards=rules).mdp()
 
 
 class WindyFrozenLakeEnv(GridWorldEnv):
@@ -94,7 +89,7 @@ class WindyFrozenLakeEnv(GridWorldEnv):
     ## Arguments
     `desc` (a map's name: empty, four_rooms, holes, ridge, zigzag; or rows of tiles), `wind` (array
     [2, rows, cols] of angle and strength; default the same everywhere: `wind_angle` in radians, rows grow downward,
-    and `wind_strength` in [0, 1]), `n_actions` (4, 5, 8, 9), `action_success_prob` (a number, or one an action),
+    and `wind_strength` in [0, 1]), `n_actions` (4, 5, 8, 9), `action_success_prob` (a number, or one per action),
     `cyclic`, `trap_reward`, `tile_rewards`, `render_mode` ("ansi" or "rgb_array").
 
     ## Version History
@@ -114,13 +109,7 @@ class WindyFrozenLakeEnv(GridWorldEnv):
         tile_rewards: Mapping[str, float] | None = None,
         render_mode: str | None = None,
     ) -> None:
-        grid = _lake(
-            desc,
-            uniform_wind(wind_angle, wind_strength) if wind is None else wind,
-            trap_reward=trap_reward,
-            n_actions=n_actions,
-            action_success_prob=action_success_prob,
-            cyclic=cyclic,
-            tile_rewards=tile_rewards or {},
-        )
+        field = uniform_wind(wind_angle, wind_strength) if wind is None else wind
+        rules = dict(tile_rewards or {})
+        grid = GridWorld(_tiles(desc), field, trap_reward, action_success_prob, n_actions, cyclic, rules)
         super().__init__(grid, render_mode)

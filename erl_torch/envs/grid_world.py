@@ -1,4 +1,4 @@
-"""Windy grid worlds: rows of tiles and a wind field, turned into a TabularMDP.
+"""Turn windy grid worlds, rows of tiles and a wind field, into TabularMDPs.
 
 Rules (state = row * n_cols + col, row 0 on top)
 
@@ -11,8 +11,8 @@ Rules (state = row * n_cols + col, row 0 on top)
     ends     from H or G every action leads to the start distribution: uniform over the S tiles, or over
              the F tiles if there is no S. Nothing terminates (`cyclic`); otherwise that step ends the episode.
     moves    elsewhere the wind moves first, then the action, which succeeds with `action_success_prob[a]`
-             and otherwise leaves the agent where the wind left it. Walls block each part; borders clip it, so
-             that a diagonal step slides along them.
+             and otherwise leaves the agent where the wind left it. Walls block each of the two moves; borders clip
+             it, so that a diagonal step slides along them.
     wind     blows on F tiles only. With strength w in [0, 1], angle phi (rows grow downward),
              h = sqrt(w) cos(phi), v = sqrt(w) sin(phi): P(left) = max(0,-h)^2, P(down) = max(0,v)^2,
              P(right) = max(0,h)^2, P(up) = max(0,-v)^2, P(none) = the rest.
@@ -20,6 +20,7 @@ Rules (state = row * n_cols + col, row 0 on top)
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -32,7 +33,7 @@ from erl_torch.checks import InputError
 from erl_torch.mdp.tabular import TabularMDP
 
 TILES = "SFRHGWCN"
-ENDS = "HG"
+END_TILES = "HG"
 DEFAULT_REWARD = -1.0
 TILE_REWARDS = {"G": 0.0, "C": -0.5, "N": -1.5}
 # (row, col) of each action; the first five are the wind's, too.
@@ -43,16 +44,19 @@ ACTIONS = {4: [0, 1, 2, 3], 5: [0, 1, 2, 3, 4], 8: [0, 1, 2, 3, 5, 6, 7, 8], 9: 
 
 @dataclass(frozen=True, eq=False)
 class GridWorld:
-    """Tiles and wind. Raises InputError for ragged rows, unknown tiles, no start, or a bad wind field.
+    """Tiles and wind.
 
     Args:
         desc: rows of tiles, all of one length.
-        wind: angle (radians) and strength (in [0, 1]): [2, rows, cols], or [2] for all tiles; None is no wind.
+        wind: angle (radians) and strength (in [0, 1]), [2, rows, cols], or [2] for all tiles; None is no wind.
         trap_reward: reward of leaving an H tile.
-        action_success_prob: one number in [0, 1], or one an action.
+        action_success_prob: one number in [0, 1], or one per action.
         n_actions: 4, 5, 8 or 9.
-        cyclic: whether H and G lead back to the start; otherwise leaving them ends the episode.
-        tile_rewards: rewards of leaving other tiles than the rules have, as {"C": -0.25}.
+        cyclic: H and G lead back to the start; False: a step from them ends the episode.
+        tile_rewards: rewards of leaving a tile, where they differ from the rules, as {"C": -0.25}.
+
+    Raises:
+        InputError: ragged rows, unknown tiles, no start, a bad wind field, or an argument out of range.
     """
 
     desc: tuple[str, ...]
@@ -94,8 +98,7 @@ class GridWorld:
             raise InputError("tile_rewards", list(self.tile_rewards), f"rewards of the tiles {' '.join(TILES)}")
         given = {"trap_reward": self.trap_reward} | {f"tile_rewards.{t}": r for t, r in self.tile_rewards.items()}
         for key, reward in given.items():
-            if not (checks.is_number(reward) and np.isfinite(reward)):
-                raise InputError(key, reward, "a finite number")
+            checks.finite(key, reward)
         checks.flag("cyclic", self.cyclic)
         object.__setattr__(self, "desc", rows)
         object.__setattr__(self, "wind", wind)
@@ -117,16 +120,16 @@ class GridWorld:
 
     @cached_property
     def tiles(self) -> np.ndarray:
-        """[S] single letters, state order."""
+        """[S] the letter of each state's tile."""
         return np.array(list("".join(self.desc)))
 
     @property
     def ends(self) -> np.ndarray:
         """[S] bool: traps and goals."""
-        return np.isin(self.tiles, list(ENDS))
+        return np.isin(self.tiles, list(END_TILES))
 
     def wind_probabilities(self) -> np.ndarray:
-        """[S, 5]: probabilities that the wind moves left, down, right, up, or not at all."""
+        """[S, 5] probabilities that the wind moves the agent left, down, right, up, or not at all."""
         angle, strength = self.wind.reshape(2, -1)
         strength = np.where(self.tiles == "F", strength, 0.0)
         h, v = np.sqrt(strength) * np.cos(angle), np.sqrt(strength) * np.sin(angle)
@@ -134,7 +137,7 @@ class GridWorld:
         return np.column_stack([moved, np.maximum(1 - moved.sum(1), 0)])
 
     def mdp(self) -> TabularMDP:
-        """The grid world as a TabularMDP. H and G lead to the start, also where that ends an episode."""
+        """The grid world as a TabularMDP. H and G lead to the start, also where a step from them ends an episode."""
         n_states, n_actions = self.tiles.size, self.n_actions
         start = (self.tiles == ("S" if "S" in self.tiles else "F")).astype(np.float64)
         start /= start.sum()
@@ -167,7 +170,7 @@ class GridWorld:
         )
 
     def _targets(self) -> np.ndarray:
-        """[9, S]: where one step in each direction leads, borders and walls blocking."""
+        """[9, S]: the state that one step in each direction leads to; borders and walls block it."""
         rows, cols = self.shape
         state = np.arange(rows * cols)
         here = np.stack(np.divmod(state, cols))  # [2, S]
@@ -178,8 +181,5 @@ class GridWorld:
 
 def uniform_wind(wind_angle: float, wind_strength: float) -> np.ndarray:
     """The same wind everywhere, [2]. Raises InputError naming the argument."""
-    if not (checks.is_number(wind_angle) and np.isfinite(wind_angle)):
-        raise InputError("wind_angle", wind_angle, "a finite number (radians)")
-    if not (checks.is_number(wind_strength) and 0 <= wind_strength <= 1):
-        raise InputError("wind_strength", wind_strength, "a number in [0, 1]")
-    return np.array([wind_angle, wind_strength], dtype=np.float64)
+    angle = checks.number("wind_angle", wind_angle, math.isfinite, "a finite number (radians)")
+    return np.array([angle, checks.number("wind_strength", wind_strength, lambda x: 0 <= x <= 1, "a number in [0, 1]")])

@@ -1,14 +1,14 @@
 """Random windy mazes of the paper's Figure 2 and Table S1.
 
-Layout: all F, S at row -2 col 1, G at row 1 col -2, then traps H uniformly among the F tiles without replacement,
-none of them in the 3x3 blocks around S and G (the paper draws again until that holds: the same law).
+Layout: all F, S at row -2 col 1, G at row 1 col -2. Traps H are drawn uniformly among the F tiles without replacement,
+outside the 3x3 blocks around S and G (the paper draws again until that holds, which is the same law).
 
 Wind: one angle for all tiles, then five in-place raster sweeps, i = 1..5, in which each angle becomes the mean of
-itself and its four neighbours (periodic) plus N(0, 0.6 pi / i); strength ~ Beta(wind_level, 2) a tile, then one such
-sweep of means. No wind is felt on S, G and H, and none is stored there.
+itself and its four neighbours (periodic) plus N(0, 0.6 pi / i). The strength of each tile is drawn from
+Beta(wind_level, 2); one such sweep of means follows. The wind does not blow on S, G and H: there it is stored as 0.
 
 All numbers come from the raw 64-bit words of PCG64, whose stream NumPy keeps for ever, through inverse
-distribution functions: a seed gives the same maze on every machine and in every version.
+distribution functions. So a seed gives the same maze on every machine and in every version.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from erl_torch.envs import kernels
 from erl_torch.envs.grid_world import GridWorld
 
 SWEEPS = 5
-CELL_BYTES = 2500  # of a tile, while its model is made
+CELL_BYTES = 2500  # of memory per tile, while the model is made
 BATCH_NUMBERS = 4_000_000  # random numbers in memory at once
 
 
@@ -57,7 +57,7 @@ def random_mazes(
         n: whole number >= 0.
         size: rows and columns, >= 5.
         n_traps: number of traps; None takes ``density``.
-        density: traps for each row length, where n_traps is None: round(size * density), half to even.
+        density: traps per row length, where n_traps is None: round(size * density), half to even.
         wind_level: first parameter of Beta(wind_level, 2), > 0.
         seed: whole number >= 0.
         trap_reward: reward of leaving a trap.
@@ -70,11 +70,9 @@ def random_mazes(
     checks.at_least("size", size, 5)
     checks.at_least("seed", seed, 0)
     checks.positive("wind_level", wind_level)
-    if not (checks.is_number(lowest_angle) and 0 <= lowest_angle < 2 * np.pi):
-        raise InputError("lowest_angle", lowest_angle, "in [0, 2 pi)")
+    checks.number("lowest_angle", lowest_angle, lambda x: 0 <= x < 2 * np.pi, "in [0, 2 pi)")
     if n_traps is None:
-        if not (checks.is_number(density) and 0 <= density < np.inf):
-            raise InputError("density", density, "a finite number >= 0")
+        checks.number("density", density, lambda x: 0 <= x < np.inf, "a finite number >= 0")
         n_traps = round(size * density)
     checks.memory("size", size, CELL_BYTES * size**2, f"a maze of {size} x {size} tiles and its model")
     layout, free = _layout(size)
@@ -87,11 +85,11 @@ def random_mazes(
 def _layout(size: int) -> tuple[np.ndarray, np.ndarray]:
     """Tiles [size, size] without traps, and the flat indices where traps may be."""
     layout = np.full((size, size), "F")
-    near = np.zeros((size, size), bool)
+    kept = np.zeros((size, size), bool)  # free of traps
     for row, col, tile in ((size - 2, 1, "S"), (1, size - 2, "G")):
         layout[row, col] = tile
-        near[row - 1 : row + 2, col - 1 : col + 2] = True
-    return layout, np.flatnonzero(~near)
+        kept[row - 1 : row + 2, col - 1 : col + 2] = True
+    return layout, np.flatnonzero(~kept)
 
 
 def _generate(
@@ -106,7 +104,7 @@ def _generate(
     free: np.ndarray,
 ) -> Iterator[GridWorld]:
     cells = size * size
-    counts = [free.size, 1, SWEEPS * cells, cells]  # numbers a maze: traps, first angle, noise, strengths
+    counts = [free.size, 1, SWEEPS * cells, cells]  # numbers per maze: traps, first angle, noise, strengths
     batch = max(1, BATCH_NUMBERS // sum(counts))
     scale = 0.6 * np.pi / np.arange(1, SWEEPS + 1)[:, None, None]
     for first in range(0, n, batch):
@@ -125,6 +123,6 @@ def _generate(
 
 
 def _uniforms(seed: int, maze: int, n: int) -> np.ndarray:
-    """[n] numbers in (0, 1), from the upper 52 bits of the words of maze's own PCG64."""
+    """[n] numbers in (0, 1), from the upper 52 bits of the words of the PCG64 of that maze."""
     words = np.random.PCG64(np.random.SeedSequence(seed, spawn_key=(maze,))).random_raw(n)
     return ((words >> np.uint64(12)) + 0.5) * 2.0**-52

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 
-from erl_torch.envs.control import ControlEnv, ControlTask, Step
+from erl_torch.envs.control import ControlTask, FixedActionsEnv, Step
 
 FORCE, GRAVITY = 0.001, 0.0025
 LEFT, RIGHT, GOAL, MAX_SPEED = -1.2, 0.6, 0.5, 0.07
@@ -39,7 +37,7 @@ TASK = ControlTask(
 )
 
 
-class DiscreteMountainCarEnv(ControlEnv):
+class DiscreteMountainCarEnv(FixedActionsEnv):
     """Drive an underpowered car out of a valley; position and velocity are binned.
 
     ## Description
@@ -55,26 +53,18 @@ class DiscreteMountainCarEnv(ControlEnv):
     Position uniform in [-0.6, -0.4], at rest.
 
     ## Rewards
-    -1 a step. With `reward="cyclic"` 0 for the step that terminates.
+    -1 per step. With `reward="cyclic"` 0 for the step that terminates.
 
     ## Episode End
     Terminates at a position of 0.5 or more with a velocity of 0 or more. The registered environment truncates after
     500 steps.
 
     ## Arguments
-    `bins` (12, or one number a variable), `low`, `high` ([-1.2, 0.6], +-0.07), `reward` ("original" or "cyclic"),
+    `bins` (12, or one number per variable), `low`, `high` ([-1.2, 0.6], +-0.07), `reward` ("original" or "cyclic"),
     `render_mode` ("human" or "rgb_array").
 
     ## Version History
     v0: the setting of the paper's Table S2.
     """
 
-    def __init__(
-        self,
-        bins: int | Sequence[int] | None = None,
-        low: Sequence[float] | None = None,
-        high: Sequence[float] | None = None,
-        reward: str = "original",
-        render_mode: str | None = None,
-    ) -> None:
-        super().__init__(TASK, bins, low, high, None, reward, render_mode)
+    task = TASK

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -71,20 +70,11 @@ class DiscretePendulumEnv(ControlEnv):
     None. The registered environment truncates after 500 steps.
 
     ## Arguments
-    `bins` (16, or one number a variable), `low`, `high` (+-pi, +-8), `torques` (-2, 0, 2; at most 2 in size),
+    `bins` (16, or one number per variable), `low`, `high` (+-pi, +-8), `torques` (-2, 0, 2; at most 2 in size),
     `reward` ("original" or "cyclic", here the same), `render_mode` ("human" or "rgb_array").
 
     ## Version History
     v0: the setting of the paper's Table S2.
     """
 
-    def __init__(
-        self,
-        bins: int | Sequence[int] | None = None,
-        low: Sequence[float] | None = None,
-        high: Sequence[float] | None = None,
-        torques: Sequence[float] | None = None,
-        reward: str = "original",
-        render_mode: str | None = None,
-    ) -> None:
-        super().__init__(TASK, bins, low, high, torques, reward, render_mode)
+    task = TASK

@@ -14,14 +14,15 @@ from erl_torch.mdp.tabular import TabularMDP
 
 
 class TabularEnv(gym.Env[np.int64, np.int64]):
-    """Steps through a TabularMDP. It terminates in the states of ``ends`` alone; a time limit truncates.
+    """Step through a TabularMDP. Only the states of ``ends`` terminate an episode; a time limit truncates it.
 
     Observation: the state, Discrete(n_states). Action: Discrete(n_actions). Reward: ``mdp.reward[s, a]``.
 
     Args:
         mdp: the process.
         render_mode: "ansi" or None.
-        ends: [S] bool: any step from such a state ends the episode there, where ``mdp`` leads to the start.
+        ends: [S] bool: every step from such a state ends the episode, and the agent stays there; ``mdp`` leads to the
+            start instead. None is no such state.
 
     Raises:
         InputError: an unknown render_mode.
@@ -63,7 +64,7 @@ class TabularEnv(gym.Env[np.int64, np.int64]):
         self.state = int(p.indices[entries][min(drawn, len(cdf) - 1)])
         return np.int64(self.state), reward, False, False, {}
 
-    def render(self) -> Any:
+    def render(self) -> str | np.ndarray | None:
         if self.render_mode == "ansi":
             return f"state {self.state}\n"
         return None
@@ -105,7 +106,7 @@ class TabularFileEnv(TabularEnv):
 
 
 class GridWorldEnv(TabularEnv):
-    """A TabularEnv on a grid, rendered as text (``ansi``) or picture (``rgb_array``)."""
+    """A TabularEnv on a grid, rendered as text (``ansi``) or as a picture (``rgb_array``)."""
 
     metadata = {"render_modes": ["ansi", "rgb_array"], "render_fps": 4}  # noqa: RUF012
 
@@ -114,7 +115,7 @@ class GridWorldEnv(TabularEnv):
         self.grid = grid
         self._board: np.ndarray | None = None
 
-    def render(self) -> Any:
+    def render(self) -> str | np.ndarray | None:
         if self.render_mode == "ansi":
             return self._render_text()
         if self.render_mode == "rgb_array":
@@ -129,7 +130,6 @@ class GridWorldEnv(TabularEnv):
         scale: float = 3,
     ) -> np.ndarray:
         """A picture [height, width, 3] for print: tiles, wind, a policy [S, A], a distribution over states [S]."""
-
         return grid_pictures.grid_picture(self.grid, policy, distribution, title, scale=scale)
 
     def _render_text(self) -> str:
@@ -141,7 +141,6 @@ class GridWorldEnv(TabularEnv):
         return "\n".join(lines) + "\n"
 
     def _render_picture(self) -> np.ndarray:
-
         if self._board is None:
             self._board = grid_pictures.board(self.grid)
         return grid_pictures.with_agent(self._board, self.grid.shape, divmod(self.state, self.grid.shape[1]))

@@ -49,7 +49,7 @@ class Gains(NamedTuple):
 
     @property
     def theta_bounds(self) -> tuple[float, float]:
-        """On theta*, reward a step."""
+        """On theta*, reward per step."""
         return -float(self.high.max()), -float(self.low.min())
 
 
