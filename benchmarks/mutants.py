@@ -1203,7 +1203,7 @@ MUTANTS = [
     Mutant(
         "pairs never tried count for nothing",
         "empirical/uncertainty.py",
-        "    untried = _untried(part, here) if optimal else 0.0",
+        "    untried = _untried(empirical, here) if optimal else 0.0",
         "    untried = 0.0",
         "test_uncertainty.py::test_pairs_never_tried_widen_one_side",
     ),
@@ -1645,7 +1645,7 @@ MUTANTS = [
     Mutant(
         "equal mean rewards are equal rewards",
         "empirical/uncertainty.py",
-        "if np.ptp(rewards) == 0 and not model.reward_variance[part.used].any():",
+        "if np.ptp(rewards) == 0 and not model.reward_variance[empirical.used].any():",
         "if np.ptp(rewards) == 0:",
         "test_interval_rules.py::test_interval_of_one_row_is_students",
     ),
@@ -1659,7 +1659,7 @@ MUTANTS = [
     Mutant(
         "the successor hidden at the low end is the best",
         "empirical/uncertainty.py",
-        "_with_successor(model, part, rows, sign * here.value)",
+        "_with_successor(model, empirical, rows, sign * here.value)",
         "_with_successor(model, part, rows, here.value)",
         "test_interval_rules.py::test_a_row_hides_what_another_action_has_shown_on_either_side",
     ),
@@ -1701,7 +1701,7 @@ MUTANTS = [
     Mutant(
         "smallest visits of pairs that do not count",
         "empirical/uncertainty.py",
-        "np.flatnonzero(variance > COUNTS * total)",
+        "np.flatnonzero(variance > COUNTED_SHARE * total)",
         "np.flatnonzero(variance > 0)",
         "test_interval_rules.py::test_smallest_visits_are_of_pairs_that_count",
     ),
@@ -1771,15 +1771,15 @@ MUTANTS = [
     Mutant(
         "rounding takes theta out of range",
         "empirical/reservations.py",
-        "if outside > BEYOND * max(abs(low), abs(high)):",
+        "if outside > RANGE_MARGIN * max(abs(low), abs(high)):",
         "if outside > 0:",
         "test_reservations.py::test_theta_out_of_range_by_rounding_is_not_out_of_range",
     ),
     Mutant(
         "states led to may be missing",
         "empirical/reservations.py",
-        "return bool(tried[inside].all() and inside[p.indices[entry]].all())",
-        "return bool(tried[inside].all())",
+        "return bool(tried[members].all() and members[p.indices[entry]].all())",
+        "return bool(tried[members].all())",
         "test_reservations.py::test_data_without_a_state_that_theirs_lead_to_are_not_of_the_models_theta",
     ),
     Mutant(

@@ -14,7 +14,7 @@ import erl_torch
 from erl_torch import NonFiniteError, TabularMDP, Transitions, collect
 from erl_torch.empirical.counts import empirical_mdp, tally
 from erl_torch.empirical.reservations import (
-    FAR,
+    FAR_HALF_WIDTHS,
     Reservation,
     _covered,
     count,
@@ -297,10 +297,10 @@ def test_theta_far_from_the_data_is_counted_in_half_widths():
     for k in (0.0, 0.9, -3.0, 30.0):
         assert half_widths(1 + k * half, estimate) == pytest.approx(abs(k), rel=1e-5, abs=1e-9)
     rewards = (-2.0, 0.0)
-    assert of_theta(1 + 0.99 * FAR * half, rewards, estimate) == []
+    assert of_theta(1 + 0.99 * FAR_HALF_WIDTHS * half, rewards, estimate) == []
     for sign in (1, -1):
-        (found,) = of_theta(1 + sign * 1.01 * FAR * half, rewards, estimate)
-        assert f"is {1.01 * FAR:.3g} {FAR_OFF}, theta = 1.000 +- 0.020" in found.text
+        (found,) = of_theta(1 + sign * 1.01 * FAR_HALF_WIDTHS * half, rewards, estimate)
+        assert f"is {1.01 * FAR_HALF_WIDTHS:.3g} {FAR_OFF}, theta = 1.000 +- 0.020" in found.text
     withheld = Estimate("theta", 1.0, 0.01, withheld="of few events")
     assert of_theta(1.9, rewards, withheld) == []
     assert math.isnan(half_widths(1.9, withheld))
@@ -318,7 +318,7 @@ def test_published_s1_at_a_high_temperature_is_far_off_and_says_so(tmp_path, cap
     theta, away, value, half = map(float, (theta, away, value, half))
     assert abs(theta - value) / half <= 1.01 * away
     assert abs(theta - value) / (half - unit) >= 0.99 * away
-    assert away > FAR
+    assert away > FAR_HALF_WIDTHS
     result = json.loads((tmp_path / "one" / "result.json").read_text())
     assert result["data_half_widths"] == pytest.approx(away, rel=0.01)
     many = notes(tmp_path / "many", "n_replicas=2", learner=full)

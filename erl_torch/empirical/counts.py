@@ -1,25 +1,25 @@
 """The empirical model of a stream: visit counts, transition frequencies, mean rewards.
 
-What no tuple shows is no part of the problem. ``EmpiricalMDP.problem`` poses it over what remains:
+What no tuple shows is no part of the problem. ``EmpiricalMDP.problem`` poses the problem on the rest:
 
     pairs     a pair (s,a) never visited is not available: the optimum is over the visited pairs. The KL cost is still
               that of the whole prior, so with m(s) the prior's mass on the visited actions of s
               sum_visited pi0 exp(beta q) = m sum_visited (pi0/m) exp(beta q): a reward log(m(s))/beta on top.
-    states    a state never left (the last of an episode, say) has no known future: the tuples that lead there are
+    states    a state never left (as the last of an episode) has no known future: the tuples that lead there are
               left out, and with them the pairs and states that have no other tuples.
-    classes   where the empirical process has several closed classes, the one with the most tuples is the problem;
-              where it has one, states from which it is reached are in too.
+    classes   where the empirical process has several closed classes, the problem is the one with the most tuples;
+              where it has one, states from which that is reached take part too.
 
-States outside keep the prior policy. ``message`` says what was left out.
+States that take no part keep the prior policy. ``message`` names what was left out.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
+from numpy.typing import ArrayLike
 
 from erl_torch import checks
 from erl_torch.checks import InputError
@@ -34,7 +34,7 @@ BLOCK = 1 << 16  # tuples at a time: they stay in the processor's cache
 
 @dataclass(frozen=True, eq=False)
 class EmpiricalMDP:
-    """Sufficient statistics of a stream: S*A and nnz numbers, whatever its length."""
+    """Sufficient statistics of a stream: S*A and nnz numbers, for a stream of any length."""
 
     visits: np.ndarray  # n(s,a), [S, A] int64
     transition: sp.csr_array  # n(s,a,s')/n(s,a), [S*A, S]; rows without visits are empty
@@ -50,18 +50,18 @@ class EmpiricalMDP:
     def n_actions(self) -> int:
         return int(self.visits.shape[1])
 
-    def problem(self, beta: float, prior_policy: Any = None) -> EmpiricalProblem:
-        """The empirical problem; see the module's docstring for what is left out.
+    def problem(self, beta: float, prior_policy: ArrayLike | None = None) -> EmpiricalProblem:
+        """The empirical problem; the module's docstring says what is left out.
 
         Raises:
             InputError: beta or prior out of range, or no state that is ever returned to.
         """
         beta = checks.temperature("beta", beta)
         prior = check_prior("prior_policy", prior_policy, self.n_states, self.n_actions)
-        used, entries, message, reducible = self._part()
-        inside = used.any(1)
-        states = np.flatnonzero(inside)
-        # A pair that is not used repeats one that is, with a prior of 0: shapes stay [n, A], the graph is unchanged.
+        used, entries, message, reducible = self._solvable()
+        taken = used.any(1)
+        states = np.flatnonzero(taken)
+        # A pair that is not used repeats one that is, with a prior of 0. So shapes stay [n, A], and the graph stays.
         action = np.where(used, np.arange(self.n_actions), used.argmax(1)[:, None])[states]
         rows = (states[:, None] * self.n_actions + action).ravel()
         p = self.transition.copy()
@@ -77,7 +77,7 @@ class EmpiricalMDP:
         problem = BellmanProblem(states, p, reward, weight / mass, start, float(beta))
         return EmpiricalProblem(problem, used, message, reducible, np.minimum(mass[:, 0], 1.0))
 
-    def _part(self) -> tuple[np.ndarray, np.ndarray, str, bool]:
+    def _solvable(self) -> tuple[np.ndarray, np.ndarray, str, bool]:
         """(pairs that take part [S, A], entries of ``transition`` that do [nnz], message, several closed classes)."""
         p, n_actions = self.transition, self.n_actions
         pair_of = np.repeat(np.arange(self.visits.size), np.diff(p.indptr))
@@ -98,34 +98,34 @@ class EmpiricalMDP:
         closed[label[~alive]] = False  # states that take no part are classes of their own
         if closed.sum() > 1:
             tuples = np.bincount(label, self.visits.sum(1)) * closed
-            inside = label == np.argmax(tuples)
-            used &= inside[:, None]
-            entries &= inside[pair_of // n_actions]
+            members = label == np.argmax(tuples)
+            used &= members[:, None]
+            entries &= members[pair_of // n_actions]
             message = (
-                f"{closed.sum()} closed sets of states in this stream; solved on {_name(inside)}, the most visited"
+                f"{closed.sum()} closed sets of states in this stream; solved on {_name(members)}, the most visited"
             )
         return used, entries, message, bool(closed.sum() > 1)
 
 
-def _name(inside: np.ndarray) -> str:
-    states = np.flatnonzero(inside)
+def _name(members: np.ndarray) -> str:
+    states = np.flatnonzero(members)
     return f"{states[:5].tolist()}{'...' if len(states) > 5 else ''}"
 
 
 @dataclass(frozen=True, eq=False)
 class EmpiricalProblem:
-    """The soft Bellman problem that a stream poses."""
+    """The soft Bellman problem that a stream poses, and what it leaves out."""
 
     problem: BellmanProblem  # on the states that take part
     used: np.ndarray  # [S, A] bool, pairs that take part
-    message: str  # what was left out, and why; "" if nothing was
-    reducible: bool  # the stream shows several closed classes; this is the most visited
+    message: str  # what was left out, and why; "" where nothing was
+    reducible: bool  # the stream shows several closed classes; the problem is the most visited one
     tried: np.ndarray  # the prior's mass on the pairs that take part, [n]
 
 
 @dataclass(frozen=True, eq=False)
 class Tally:
-    """What one pass over a stream tells, in memory for S*A pairs and the distinct (s,a,s')."""
+    """The counts of one pass over a stream, in memory for S*A pairs and the distinct (s,a,s')."""
 
     visits: np.ndarray  # [S*A] int64
     indptr: np.ndarray  # [S*A + 1], rows of the (s,a,s') met
@@ -139,19 +139,19 @@ class Tally:
 
     @property
     def psi_map(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """W as CSR [S*A, S] without the visits that have underflowed; the decay is (1 - lr_psi)**visits."""
+        """W as CSR [S*A, S] without weights that underflowed; the decay is (1 - lr_psi)**visits."""
         kept = self.psi_weight > 0
         indptr = np.concatenate(([0], np.cumsum(kept)))[self.indptr]
         return indptr, self.indices[kept], self.psi_weight[kept]
 
 
 def tally(data: Experience, n_states: int, n_actions: int, lr_psi: float = 0.0) -> Tally:
-    """Count a stream: to the same bits, however it is cut.
+    """Count a stream. The bits do not depend on how it is cut into chunks.
 
     Args:
         data: the tuples; a' is not used.
         n_states, n_actions: sizes of the tables.
-        lr_psi: step size of lines 2-3 of Algorithm S1, for W; 0: there is none.
+        lr_psi: step size of lines 2-3 of Algorithm S1, for W; 0 computes no W.
 
     Raises:
         InputError: naming the first tuple with a state or action out of range.
@@ -204,24 +204,24 @@ def _table(keys: np.ndarray, used: int, size: int) -> tuple[np.ndarray, int]:
     return table, shift
 
 
-def empirical_mdp(data: Experience, n_states: int, n_actions: int, found: Tally | None = None) -> EmpiricalMDP:
+def empirical_mdp(data: Experience, n_states: int, n_actions: int, counted: Tally | None = None) -> EmpiricalMDP:
     """Counts and mean rewards of a stream: one pass over it, and two more where rewards vary.
 
     Args:
         data: the tuples; a' is not used.
         n_states, n_actions: sizes of the tables.
-        found: the tally of the stream, where there is one already.
+        counted: the tally of the stream, where the caller has it.
 
     Raises:
         InputError: naming the first tuple with a state or action out of range.
     """
-    found = found or tally(data, n_states, n_actions)
-    visits, base = found.visits, found.last_reward
+    counted = counted or tally(data, n_states, n_actions)
+    visits, base = counted.visits, counted.last_reward
     n = np.maximum(visits, 1)
-    # Around one reward of each pair, so that a constant reward has exactly itself as mean.
+    # Sums of differences from one reward of the pair: the mean of a constant reward is exactly that reward.
     off, squares = np.zeros(len(visits)), np.zeros(len(visits))
     reward = base + off
-    if found.varied:
+    if counted.varied:
         with np.errstate(over="ignore", invalid="ignore"):
             for chunk in data.chunks():
                 pair = chunk.s * np.int32(n_actions) + chunk.a
@@ -231,15 +231,15 @@ def empirical_mdp(data: Experience, n_states: int, n_actions: int, found: Tally 
                 pair = chunk.s * np.int32(n_actions) + chunk.a
                 np.add.at(squares, pair, (chunk.r - reward[pair]) ** 2)
         if not np.isfinite(squares).all():
-            low, high = found.reward_range
+            low, high = counted.reward_range
             raise InputError("r", f"between {low:g} and {high:g}", "of a size whose squares are finite numbers")
-    rows = np.diff(found.indptr)
+    rows = np.diff(counted.indptr)
     return EmpiricalMDP(
         visits=visits.reshape(n_states, n_actions),
         transition=sp.csr_array(
-            (found.counts / np.repeat(n, rows), found.indices, found.indptr), shape=(len(visits), n_states)
+            (counted.counts / np.repeat(n, rows), counted.indices, counted.indptr), shape=(len(visits), n_states)
         ),
         reward=reward.reshape(n_states, n_actions),
         reward_variance=(squares / np.maximum(visits - 1, 1)).reshape(n_states, n_actions),
-        reward_given_next=found.reward_given_next,
+        reward_given_next=counted.reward_given_next,
     )

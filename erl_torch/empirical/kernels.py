@@ -1,4 +1,4 @@
-"""Tuples counted into rows, and rows that the counts allow.
+"""Count tuples into rows, and move rows as far as the counts allow.
 
 Kernels take plain C-contiguous arrays and scalars, use no globals, and validate nothing: the callers do.
 ``error_model="numpy"``: a division by zero gives inf or nan for the caller to find, and no check costs time.

@@ -1,4 +1,4 @@
-"""How far theta and a policy's value may be off, from the visit counts alone.
+"""The error of theta and of a policy's value, from the visit counts alone.
 
 J(pi), the reward rate less KL/beta, of the empirical model moves with each row p(.|s,a) and mean reward that the data
 got wrong. To first order, with V the relative value of pi and d its stationary distribution over pairs,
@@ -21,14 +21,14 @@ a successor has one draw alone, anywhere: n draws may hide an event of chance 1 
 interval wide and lopsided; where much was seen it is value -+ t se. Each end is found by steps: to the models worst
 to first order, J there, and on.
 
-What is assumed: the draws of a pair are independent and alike, noise in the reward of one (s,a,s') is about normal in
-its mean, and what was seen nowhere (a state, a penalty) is not there. Then
+Assumptions: the draws of a pair are independent and alike, the mean of the noise in the reward of one (s,a,s') is
+about normal, and what was seen nowhere (a state, a penalty) does not exist. Then
 
     second order  noise in the rows moves J on average (the optimum of a model with errors picks among its errors and
-                  looks better than it is): derived in docs/theory.md, 4, and taken off
+                  looks better than it is); derived in docs/theory.md, 4, and subtracted
     luck          where actions' values differ by less than their noise and 1/beta is small beside it, the optimum
-                  takes the luckier one: the mean of its luck widens one side
-    never tried   pairs widen one side, were they to bring the best that was seen from their state
+                  takes the luckier one; the mean of its luck widens one side
+    never tried   pairs that were never tried may bring the best that was seen from their state; that widens one side
 
 ``smallest_visits`` is the fewest draws of a pair behind at least 1% of the variance; ``withheld`` says why there is no
 interval, where there is none.
@@ -36,7 +36,7 @@ interval, where there is none.
 A state that the data never show is no part of the problem (``erl_torch.empirical.counts``), nor of the error.
 
 The bootstrap draws n(s,a) successors anew for every pair (multinomial; the reward's mean with the noise left at a given
-successor), and solves each model: it sees the second order, and takes off nothing.
+successor), and solves each model. It includes the second order, and subtracts nothing.
 """
 
 from __future__ import annotations
@@ -45,10 +45,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from statistics import NormalDist
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
+from numpy.typing import ArrayLike
 from scipy import optimize, special
 
 from erl_torch import checks
@@ -63,17 +64,17 @@ from erl_torch.solvers.policy import kl_per_state
 from erl_torch.solvers.problem import BellmanProblem
 from erl_torch.solvers.soft_bellman import solve_problem
 
-COUNTS = 0.01  # share of the variance from which a pair counts
-BIAS_STATES = 1000  # beyond, the second order is an average over random signs: exact, it takes S linear systems
-SIGNS = 100
+COUNTED_SHARE = 0.01  # of the variance, from which on a pair counts for ``smallest_visits``
+BIAS_STATES = 1000  # beyond, the second order is a mean over random signs, as the exact one takes S linear systems
+SIGNS = 100  # vectors of random signs
 FALLS_APART = "the policy's chain falls into parts that double precision cannot join"
 MOST_DIGITS = 15
-LOPSIDED = 0.1  # the middle's distance from the value, in half widths
-HALF = 0.5  # of the plug-in's standard error, that of resamples at least
+LOPSIDED = 0.1  # half widths between the middle and the value, from which on both ends are printed
+LEAST_RESAMPLED = 0.5  # of the plug-in's standard error; resamples with less are too alike
 MAX_STEPS = 50
 PATIENCE = 10  # steps that gain nothing, where J has kinks
-FAR = 100.0  # logarithm of the price at which likelihood is given away
-CLOSE = 0.01  # part of the half width: an end is found where a step moves it by less (at kinks, a few hundredths)
+LARGEST_LOG_PRICE = 100.0  # logarithm of a price at which likelihood costs nothing
+END_TOLERANCE = 0.01  # of the half width: steps stop where one moves the end by less (at kinks, a few hundredths)
 TIED = 2.0  # standard errors between two actions' values, up to which either may be the better
 COMMON = 0.5  # share of the states; a successor met from more of them may be met from any
 
@@ -87,20 +88,20 @@ class Estimate:
     value: float  # reward per step
     standard_error: float
     samples: np.ndarray | None = None  # of the bootstrap, [n]
-    variance: np.ndarray | None = None  # what each pair adds to standard_error^2, [S, A]; plug-in
+    variance: np.ndarray | None = None  # share of each pair in standard_error^2, [S, A]; plug-in
     visits: np.ndarray | None = None  # [S, A]
-    freedom: float = np.inf  # of standard_error, as of Student's t
-    bias: float = 0.0  # of second order; taken off ``value`` already
+    freedom: float = np.inf  # degrees of freedom of standard_error (Student's t)
+    bias: float = 0.0  # of second order; subtracted from ``value`` already
     untried: tuple[float, float] = (0.0, 0.0)  # by how much pairs never visited may lower and raise the figure
     smallest_visits: int | None = None  # of the pairs behind at least 1% of the variance
     withheld: str = ""  # why there is no interval, if there is none
-    limits: Callable[[float], tuple[float, float]] | None = None  # figures of log-likelihood down by as much; plug-in
+    limits: Callable[[float], tuple[float, float]] | None = None  # fall of the log-likelihood -> interval; plug-in
 
     def interval(self, level: float = 0.95) -> tuple[float, float]:
-        """Two-sided; infinite where it is withheld. Of a bootstrap the basic one (samples mirrored at the value).
+        """The two-sided interval at ``level``, a number in (0, 1); infinite where it is withheld.
 
-        Of a plug-in estimate that of the likelihood, down by t^2/2, t of Student's distribution; what was never tried
-        comes on top.
+        A bootstrap gives the basic interval (samples mirrored at the value). A plug-in estimate gives that of the
+        likelihood, down by t^2/2 with t of Student's distribution; the effect of pairs never tried is added.
         """
         level = checks.number("level", level, lambda x: 0 < x < 1, "a number in (0, 1)")
         if self.withheld:
@@ -115,7 +116,7 @@ class Estimate:
         return low - self.untried[0], high + self.untried[1]
 
     def next_samples(self, n: int = 5) -> list[tuple[int, int, float]]:
-        """The n pairs (s, a, drop of the variance by one more sample), best first. Plug-in estimates only."""
+        """The n pairs (s, a, drop of the variance by one more sample), largest drop first. Plug-in estimates only."""
         n = checks.at_least("n", n, 1)
         if self.variance is None or self.visits is None:
             raise InputError("next_samples", "bootstrap", "asked of a plug-in estimate")
@@ -132,15 +133,15 @@ class Estimate:
         near = min(self.value - low, high - self.value)
         digits = 4
         if near > 0:
-            first = int(np.floor(np.log10(near)))  # of its digits; two are shown where the first is a 1
+            first = int(np.floor(np.log10(near)))  # place of its first digit; two digits are printed where that is a 1
             digits = min(max(0, (near < 2 * 10.0**first) - first), MOST_DIGITS)
-        # What is printed holds what is meant.
+        # Round so that the printed interval contains the interval.
         unit = 10.0**-digits
         if abs(0.5 * (low + high) - self.value) > LOPSIDED * 0.5 * (high - low):
             low, high = np.floor(low / unit) * unit, np.ceil(high / unit) * unit
             return f"{self.name} = {self.value:.{digits}f} in [{low:.{digits}f}, {high:.{digits}f}]"
-        shown = float(f"{self.value:.{digits}f}")
-        half = max(0.0, np.ceil(max(high - shown, shown - low) / unit - 1e-9)) * unit
+        printed = float(f"{self.value:.{digits}f}")
+        half = max(0.0, np.ceil(max(high - printed, printed - low) / unit - 1e-9)) * unit
         return f"{self.name} = {self.value:.{digits}f} +- {half:.{digits}f}"
 
 
@@ -148,12 +149,12 @@ def _normal(level: float) -> float:
     return NormalDist().inv_cdf((1 + level) / 2)
 
 
-def _check_model(model: Any) -> None:
+def _check_model(model: object) -> None:
     checks.instance("model", model, EmpiricalMDP, "an EmpiricalMDP, as of empirical_mdp")
 
 
-def theta_uncertainty(model: EmpiricalMDP, beta: float, prior_policy: Any = None) -> Estimate:
-    """Plug-in estimate of theta* from counts, less its bias of second order, with its error (docs/theory.md, 4).
+def theta_uncertainty(model: EmpiricalMDP, beta: float, prior_policy: ArrayLike | None = None) -> Estimate:
+    """Plug-in estimate of theta* from counts, less its bias of second order, and its error (docs/theory.md, 4).
 
     Args:
         model: counts and mean rewards, of ``empirical_mdp``.
@@ -164,26 +165,28 @@ def theta_uncertainty(model: EmpiricalMDP, beta: float, prior_policy: Any = None
         InputError: beta or prior out of range, or a stream that never returns to any state.
     """
     _check_model(model)
-    part = model.problem(beta, prior_policy)
-    solution = solve_problem(part.problem, model, prior_policy)
+    empirical = model.problem(beta, prior_policy)
+    solution = solve_problem(empirical.problem, model, prior_policy)
     policy = solution.policy.numpy()
     try:
-        found = _plug_in(model, part, policy[part.problem.states], optimal=True)
-    except SingularChainError:  # the optimum keeps to a part that the process leaves at last, or all but closed parts
+        estimate = _plug_in(model, empirical, policy[empirical.problem.states], optimal=True)
+    except SingularChainError:  # the optimum stays in states that the process leaves at last, or sets all but closed
         return Estimate("theta", np.nan, np.inf, withheld=FALLS_APART)
-    limits = found.limits
+    limits = estimate.limits
     return replace(
-        found,
+        estimate,
         name="theta",
-        value=-found.value,
-        bias=-found.bias,
-        untried=found.untried[::-1],
+        value=-estimate.value,
+        bias=-estimate.bias,
+        untried=estimate.untried[::-1],
         limits=None if limits is None else lambda budget: (-limits(budget)[1], -limits(budget)[0]),
     )
 
 
-def policy_uncertainty(model: EmpiricalMDP, policy: Any, beta: float, prior_policy: Any = None) -> Estimate:
-    """J(policy), the reward rate less KL/beta, as the counts have it, less its bias of second order, with its error.
+def policy_uncertainty(
+    model: EmpiricalMDP, policy: ArrayLike, beta: float, prior_policy: ArrayLike | None = None
+) -> Estimate:
+    """J(policy), the reward rate less KL/beta, from counts, less its bias of second order, and its error.
 
     Args:
         model: counts and mean rewards, of ``empirical_mdp``.
@@ -195,34 +198,34 @@ def policy_uncertainty(model: EmpiricalMDP, policy: Any, beta: float, prior_poli
         InputError: a policy [S, A] that takes an action never tried (in a state of the empirical problem).
     """
     _check_model(model)
-    part = model.problem(beta, prior_policy)
+    empirical = model.problem(beta, prior_policy)
     table = check_policy("policy", policy, model.n_states, model.n_actions)
-    untried = (table > 0) & ~part.used & part.used.any(1, keepdims=True)
+    untried = (table > 0) & ~empirical.used & empirical.used.any(1, keepdims=True)
     if untried.any():
         s, a = np.argwhere(untried)[0]
         raise InputError(f"policy[{s}, {a}]", table[s, a], "0, as the pair is not in the data")
     try:
-        return _plug_in(model, part, table[part.problem.states], optimal=False)
-    except SingularChainError:  # a worth for each part
+        return _plug_in(model, empirical, table[empirical.problem.states], optimal=False)
+    except SingularChainError:  # each set of states has a J of its own
         return Estimate("J", np.nan, np.inf, withheld=FALLS_APART)
 
 
 def bootstrap_theta(
     model: EmpiricalMDP,
     beta: float,
-    prior_policy: Any = None,
+    prior_policy: ArrayLike | None = None,
     n_resamples: int = 200,
     seed: int | np.random.Generator = 0,
 ) -> Estimate:
-    """Estimate of theta* with the bootstrap's standard error and samples; the same seed gives the same samples.
+    """Estimate theta*, with the bootstrap's standard error and samples; the same seed gives the same samples.
 
-    Samples whose model cannot be solved (reducible by the draw) are left out.
+    Samples whose model cannot be solved (the draw made it reducible) are left out.
 
     Args:
         model: counts and mean rewards, of ``empirical_mdp``.
         beta: inverse temperature, 1/reward, > 0.
         prior_policy: [S, A], entries > 0; None is uniform.
-        n_resamples: whole number >= 2; each solves a model.
+        n_resamples: whole number >= 2; each takes the solution of one model.
         seed: a whole number, or a generator.
 
     Raises:
@@ -256,28 +259,28 @@ def bootstrap_theta(
         raise InputError("transitions", f"a stream with {len(samples)} solvable resamples", "longer")
     error = float(np.std(samples, ddof=1))
     withheld = plug_in.withheld
-    if not withheld and error < HALF * plug_in.standard_error:
+    if not withheld and error < LEAST_RESAMPLED * plug_in.standard_error:
         withheld = "the resamples vary less than the draws: pairs that matter were drawn too few times"
     return Estimate("theta", plug_in.value + plug_in.bias, error, samples=np.array(samples), withheld=withheld)
 
 
-def _plug_in(model: EmpiricalMDP, part: EmpiricalProblem, policy: np.ndarray, optimal: bool) -> Estimate:
-    """J of ``policy`` [n, A], on the problem's states; ``optimal``: it moves with the data."""
-    problem = part.problem
+def _plug_in(model: EmpiricalMDP, empirical: EmpiricalProblem, policy: np.ndarray, optimal: bool) -> Estimate:
+    """J of ``policy`` [n, A], on the problem's states; ``optimal``: the policy moves with the data."""
+    problem = empirical.problem
     here = _worth(problem, policy)
     d, value = np.zeros(model.visits.shape), np.zeros(model.n_states)
     d[problem.states], value[problem.states] = here.d, here.value
     with np.errstate(over="ignore", invalid="ignore"):
-        rows = _rows(model, part, value)
-        weight = np.where(part.used, d**2 / np.maximum(rows.n, 1.0), 0.0)
+        rows = _rows(model, empirical, value)
+        weight = np.where(empirical.used, d**2 / np.maximum(rows.n, 1.0), 0.0)
         variance = weight * rows.variance
         total = float(variance.sum())
-        bias, bias_error = _second_order(model, part, here, policy, rows, optimal)
+        bias, bias_error = _second_order(model, empirical, here, policy, rows, optimal)
         # Welch and Satterthwaite.
         unsure = float(((variance / total) ** 2 / np.maximum(rows.n - 1, 1)).sum()) if total > 0 else 0.0
-    untried = _untried(part, here) if optimal else 0.0
-    luck = _luck(part, here, rows, policy) if optimal else 0.0
-    counts = np.flatnonzero(variance > COUNTS * total)
+    untried = _untried(empirical, here) if optimal else 0.0
+    luck = _luck(empirical, here, rows, policy) if optimal else 0.0
+    counts = np.flatnonzero(variance > COUNTED_SHARE * total)
     estimate = Estimate(
         "J",
         here.gain - bias,
@@ -288,17 +291,17 @@ def _plug_in(model: EmpiricalMDP, part: EmpiricalProblem, policy: np.ndarray, op
         bias=bias,
         untried=(0.0, untried),
         smallest_visits=int(model.visits.flat[counts].min()) if counts.size else None,
-        withheld=_same_reward(model, part) or _withheld(total, bias, untried),
+        withheld=_same_reward(model, empirical) or _withheld(total, bias, untried),
     )
-    if estimate.withheld:  # a correction that cannot be trusted is none
+    if estimate.withheld:  # the correction cannot be trusted
         return replace(estimate, value=here.gain, bias=0.0)
 
     @lru_cache(maxsize=8)
     def limits(budget: float) -> tuple[float, float]:
         if budget == 0:  # a level too small to tell from 0
             return here.gain - bias, here.gain - bias
-        low = _furthest(model, part, rows, here, -1.0, budget, policy, optimal, luck > 0)
-        high = _furthest(model, part, rows, here, 1.0, budget, policy, optimal, False)
+        low = _furthest(model, empirical, rows, here, -1.0, budget, policy, optimal, luck > 0)
+        high = _furthest(model, empirical, rows, here, 1.0, budget, policy, optimal, False)
         return low - max(bias, 0.0) - 2 * bias_error - luck, high - min(bias, 0.0) + 2 * bias_error
 
     estimate = replace(estimate, limits=limits)
@@ -308,7 +311,7 @@ def _plug_in(model: EmpiricalMDP, part: EmpiricalProblem, policy: np.ndarray, op
 
 
 class _Worth(NamedTuple):
-    """Of a policy [n, A] in a problem."""
+    """Figures of a policy [n, A] in a problem."""
 
     gain: float  # J
     d: np.ndarray  # its stationary distribution over pairs, [n, A]
@@ -322,32 +325,32 @@ def _worth(problem: BellmanProblem, policy: np.ndarray) -> _Worth:
     return _Worth(gain, lu.stationary()[:, None] * policy, value)
 
 
-def _optimum(problem: BellmanProblem, near: np.ndarray, tol: float) -> _Worth:
-    """Of the optimal policy, to ``tol`` in J: soft policy iteration from the value ``near`` [n]."""
+def _optimum(problem: BellmanProblem, value: np.ndarray, tol: float) -> _Worth:
+    """Those of the optimal policy, to ``tol`` in J, by soft policy iteration from ``value`` [n]."""
     last = -np.inf
     for _ in range(MAX_STEPS):
-        found = _worth(problem, soft_backup(problem.action_value(near), problem.prior, problem.beta)[1])
-        if not found.gain > last + tol:
+        worth = _worth(problem, soft_backup(problem.action_value(value), problem.prior, problem.beta)[1])
+        if not worth.gain > last + tol:
             break
-        last, near = found.gain, found.value
-    return found
+        last, value = worth.gain, worth.value
+    return worth
 
 
 class _Rows(NamedTuple):
-    """What the draws of each pair say of x = r + V(s'), [S, A] each."""
+    """Statistics of x = r + V(s') over the draws of each pair, [S, A] each."""
 
-    n: np.ndarray  # draws that stay inside the problem
+    n: np.ndarray  # draws whose s' is in the problem
     share: np.ndarray  # of each transition entry among them, [nnz]
     x: np.ndarray  # mean of x given s', less the row's mean, [nnz]
     noise: np.ndarray  # variance of r given s', mean over s'
     variance: np.ndarray  # of x; divisor n - 1, as that of noise
 
 
-def _rows(model: EmpiricalMDP, part: EmpiricalProblem, value: np.ndarray) -> _Rows:
+def _rows(model: EmpiricalMDP, empirical: EmpiricalProblem, value: np.ndarray) -> _Rows:
     p, shape = model.transition, model.visits.shape
-    inside = np.asarray(part.used.any(1))
+    members = np.asarray(empirical.used.any(1))
     rows = np.repeat(np.arange(model.visits.size), np.diff(p.indptr))
-    kept = p.data * (inside[p.indices] & part.used.ravel()[rows])
+    kept = p.data * (members[p.indices] & empirical.used.ravel()[rows])
     total = np.bincount(rows, kept, model.visits.size)
     n = model.visits.ravel() * total
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -357,9 +360,9 @@ def _rows(model: EmpiricalMDP, part: EmpiricalProblem, value: np.ndarray) -> _Ro
     unbiased = np.where(n > 1.5, n / np.maximum(n - 1, 1), 1.0)
     noise = _within(model, share, rows) * unbiased
     variance = np.bincount(rows, share * x**2, model.visits.size) * unbiased + noise
-    used = part.used.ravel()
+    used = empirical.used.ravel()
     once = used & ~(n > 1.5)
-    # One draw shows no variance: it is given the largest of the others.
+    # One draw shows no variance: its pair gets the largest of the others.
     for each in (noise, variance):
         each[once] = each[used & ~once].max(initial=0.0)
         each[~used] = 0.0
@@ -368,7 +371,7 @@ def _rows(model: EmpiricalMDP, part: EmpiricalProblem, value: np.ndarray) -> _Ro
 
 def _furthest(
     model: EmpiricalMDP,
-    part: EmpiricalProblem,
+    empirical: EmpiricalProblem,
     rows: _Rows,
     here: _Worth,
     sign: float,
@@ -377,16 +380,16 @@ def _furthest(
     optimal: bool,
     tied: bool,
 ) -> float:
-    """The largest (``sign`` 1) or smallest (-1) J that steps find among models whose log-likelihood is down by
+    """The largest (``sign`` 1) or smallest (-1) J that steps reach among models whose log-likelihood is down by
     ``budget`` at most; of the optimal policy or of ``policy`` [n, A]. Infinite where such a model has no J.
 
-    ``tied``: J has kinks, from one best action to another, and a step against one of them helps the other: where steps
-    gain no more they go against the mean of all policies met so far (fictitious play).
+    ``tied``: J has kinks where the best action changes, and a step against one action helps the other. So steps that
+    gain nothing are followed by steps against the mean of all policies met so far (fictitious play).
     """
-    problem = part.problem
-    p, given = _with_successor(model, part, rows, sign * here.value)
+    problem = empirical.problem
+    p, given = _with_successor(model, empirical, rows, sign * here.value)
     row = np.repeat(np.arange(problem.reward.size), np.diff(p.indptr))
-    n = np.where(part.used, np.maximum(rows.n, 1.0), np.inf)[problem.states].ravel()
+    n = np.where(empirical.used, np.maximum(rows.n, 1.0), np.inf)[problem.states].ravel()
     noise = rows.noise[problem.states].ravel()
     moved, cost = np.empty(p.nnz), np.empty(len(n))
     now, best = here, here.gain
@@ -409,7 +412,7 @@ def _furthest(
         slope = slope / unit
 
         def spent(log_price: float, slope: np.ndarray = slope, x: np.ndarray = x) -> float:
-            """Log of the likelihood spent at a price of it, over the budget; leaves the rows in ``moved``."""
+            """Logarithm of (likelihood spent at that price / budget); leaves the rows in ``moved``."""
             at = slope * np.exp(-log_price)
             kernels.likelihood_rows(p.indptr, p.data, x, at, moved, cost)
             per_draw = cost + 0.5 * at**2 * noise
@@ -425,7 +428,7 @@ def _furthest(
         )
         try:
             if optimal:
-                now = _optimum(model_there, now.value, 0.1 * CLOSE * abs(best - here.gain))
+                now = _optimum(model_there, now.value, 0.1 * END_TOLERANCE * abs(best - here.gain))
             else:
                 now = _worth(model_there, policy)
         except SingularChainError:
@@ -433,7 +436,7 @@ def _furthest(
         gained = sign * (now.gain - best)
         if gained > 0:
             best = now.gain
-        if not gained > CLOSE * abs(best - here.gain):
+        if not gained > END_TOLERANCE * abs(best - here.gain):
             idle += 1
             if not np.isfinite(now.gain):
                 return sign * np.inf
@@ -443,29 +446,31 @@ def _furthest(
 
 
 def _root(falling: Callable[[float], float]) -> float:
-    """Of a function that falls from above 0 to below, to about a thousandth; few steps where its slope is near -2.
-    -FAR if it is below 0 there."""
+    """The root, to about a thousandth, of a function that falls from above 0 to below; few steps at slopes near -2.
+
+    -LARGEST_LOG_PRICE where the function is below 0 there.
+    """
     low = high = 0.0
     step = 1.0
     while falling(low) < 0:
-        if low == -FAR:
+        if low == -LARGEST_LOG_PRICE:
             return low
-        high, low, step = low, max(low - step, -FAR), 2 * step
+        high, low, step = low, max(low - step, -LARGEST_LOG_PRICE), 2 * step
     while falling(high) >= 0:
         low, high, step = high, high + step, 2 * step
     return float(optimize.brentq(falling, low, high, xtol=1e-3))
 
 
 def _with_successor(
-    model: EmpiricalMDP, part: EmpiricalProblem, rows: _Rows, worth: np.ndarray
+    model: EmpiricalMDP, empirical: EmpiricalProblem, rows: _Rows, worth: np.ndarray
 ) -> tuple[sp.csr_array, np.ndarray]:
-    """(the problem's transitions, in every row with an entry of probability 0 for the successor of most ``worth`` [n]
-    that it may hide; mean reward of each entry less the row's, 0 where it was not seen).
+    """(the problem's transitions, each row with one more entry of probability 0: the successor of most ``worth`` [n]
+    that the row may hide; mean reward of each entry less the row's, 0 where the entry was not seen).
 
-    A row may hide what another action leads to that shares its state and a successor with it, and what is met from most
-    states (a reset, a slip); where it has a successor of one draw alone, any state.
+    A row may hide a successor of another action that shares its state and a successor with it, and a state that is met
+    from most states (a reset, a slip); where one of its successors has one draw alone, any state.
     """
-    problem = part.problem
+    problem = empirical.problem
     p, n_actions = problem.transition, problem.n_actions
     n_rows = p.shape[0]
     row = np.repeat(np.arange(n_rows), np.diff(p.indptr))
@@ -495,9 +500,9 @@ def _with_successor(
 
 
 def _second_order(
-    model: EmpiricalMDP, part: EmpiricalProblem, here: _Worth, policy: np.ndarray, rows: _Rows, optimal: bool
+    model: EmpiricalMDP, empirical: EmpiricalProblem, here: _Worth, policy: np.ndarray, rows: _Rows, optimal: bool
 ) -> tuple[float, float]:
-    """(by how much noise in rows moves J on average, standard error of that); docs/theory.md, 4.
+    """(how far noise in the rows moves J on average, standard error of that); docs/theory.md, 4.
 
     With e(s,a) the error of the mean of r + V(s') and Z = (I - K + 1 d)^-1: dV = Z (sum_a pi e), and on average over d
 
@@ -506,27 +511,27 @@ def _second_order(
     That is tr(M Z) + sum |H Z diag(source)^1/2|^2, column by column; of more than BIAS_STATES states, the mean over
     random signs in place of columns (Hutchinson).
     """
-    problem = part.problem
+    problem = empirical.problem
     states, n, n_actions = problem.states, problem.n_states, problem.n_actions
     lu, d = problem.regeneration(policy), here.d.sum(1)
     draws = np.maximum(rows.n, 1.0)
-    known = part.used & (rows.n > 1.5)  # what one draw leaves open is a rule's, and no measurement
-    noise = np.where(known, rows.variance / draws, 0.0)[states]
-    # dp of a row goes with its own e alone.
+    measured = empirical.used & (rows.n > 1.5)  # the variance of one draw is set by a rule, not measured
+    noise = np.where(measured, rows.variance / draws, 0.0)[states]
+    # dp of a row correlates with its own e alone.
     p = model.transition
     pair = np.repeat(np.arange(model.visits.size), np.diff(p.indptr))
     place = np.full(model.n_states, -1)
     place[states] = np.arange(n)
     weight = np.zeros(model.visits.shape)
     weight[states] = d[:, None] * policy**2
-    entry = (rows.share > 0) & known.ravel()[pair]
+    entry = (rows.share > 0) & measured.ravel()[pair]
     together = (weight / draws).ravel()[pair[entry]] * (rows.share * rows.x)[entry]
     at = place[pair[entry] // n_actions], place[p.indices[entry]]
     matrix = sp.csr_array((together, at), shape=(n, n))
-    found = 0.0
+    moved = 0.0
     source = (policy**2 * noise).sum(1)  # variance of sum_a pi e, state by state
     if optimal:
-        found = 0.5 * problem.beta * float((here.d * (1 - policy) * noise).sum())  # Var_pi(e)
+        moved = 0.5 * problem.beta * float((here.d * (1 - policy) * noise).sum())  # Var_pi(e)
         both = problem.beta * d[:, None] * policy * (policy * noise - source[:, None])
         choose = sp.csr_array((both.ravel(), np.arange(both.size), np.arange(0, both.size + 1, n_actions)))
         matrix = matrix + choose @ problem.transition
@@ -546,19 +551,20 @@ def _second_order(
             term += 0.5 * problem.beta * float((here.d * h**2).sum())  # Var_pi(p dV)
         terms.append(term)
     if exact:
-        return found + sum(terms), 0.0
-    return found + float(np.mean(terms)), float(np.std(terms, ddof=1) / np.sqrt(SIGNS))
+        return moved + sum(terms), 0.0
+    return moved + float(np.mean(terms)), float(np.std(terms, ddof=1) / np.sqrt(SIGNS))
 
 
-def _luck(part: EmpiricalProblem, here: _Worth, rows: _Rows, policy: np.ndarray) -> float:
-    """By how much J may be too large, beyond the second order, where actions' values differ by less than their noise.
+def _luck(empirical: EmpiricalProblem, here: _Worth, rows: _Rows, policy: np.ndarray) -> float:
+    """The amount by which J may be too large, beyond the second order, where actions' values differ by less than their
+    noise.
 
     The optimum takes the luckier of actions that may be as good as each other: it gains (1/beta) log mean exp(beta e)
     on average, e the errors of their values. The second order has (beta/2) Var_pi(e) of that, of a policy that has made
     its choice already, which is too little where beta e is not small.
     """
-    problem, n = part.problem, np.maximum(rows.n, 1.0)
-    noise = np.where(part.used, rows.variance / n, 0.0)[problem.states]
+    problem, n = empirical.problem, np.maximum(rows.n, 1.0)
+    noise = np.where(empirical.used, rows.variance / n, 0.0)[problem.states]
     with np.errstate(divide="ignore"):
         worth = problem.action_value(here.value) + np.log(problem.prior) / problem.beta
     best = worth.argmax(1)
@@ -590,28 +596,29 @@ def _withheld(variance: float, bias: float, untried: float) -> str:
     return ""
 
 
-def _same_reward(model: EmpiricalMDP, part: EmpiricalProblem) -> str:
-    rewards = model.reward[part.used]
-    if np.ptp(rewards) == 0 and not model.reward_variance[part.used].any():
+def _same_reward(model: EmpiricalMDP, empirical: EmpiricalProblem) -> str:
+    rewards = model.reward[empirical.used]
+    if np.ptp(rewards) == 0 and not model.reward_variance[empirical.used].any():
         return "every reward seen is the same"
     return ""
 
 
-def _untried(part: EmpiricalProblem, here: _Worth) -> float:
-    """What J may gain, to first order, from pairs that were never visited, were each to bring its state's best reward
-    and the best successor that was seen from there."""
-    problem = part.problem
+def _untried(empirical: EmpiricalProblem, here: _Worth) -> float:
+    """The gain of J, to first order, if each pair never visited brought the best reward and the best successor seen
+    from its state.
+    """
+    problem = empirical.problem
     ptr, to, _ = problem.pattern
-    rewards = problem.reward - np.log(part.tried)[:, None] / problem.beta
+    rewards = problem.reward - np.log(empirical.tried)[:, None] / problem.beta
     best = np.max(rewards, axis=1) + np.maximum.reduceat(here.value[to], ptr[:-1])
     better = problem.beta * (best - here.value - here.gain)
     with np.errstate(divide="ignore"):
-        gain = np.logaddexp(0.0, np.log1p(-part.tried) + better)
+        gain = np.logaddexp(0.0, np.log1p(-empirical.tried) + better)
     return float(here.d.sum(1) @ gain) / problem.beta
 
 
 def _within(model: EmpiricalMDP, weight: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Variance of the reward left once s' is known, mean over s', [S*A]; divisor n."""
+    """Variance of the reward given s', mean over s', [S*A]; divisor n."""
     visits = model.visits.ravel()
     total = model.reward_variance.ravel() * (visits - 1) / np.maximum(visits, 1)
     explained = weight * (model.reward_given_next - model.reward.ravel()[rows]) ** 2
@@ -619,7 +626,7 @@ def _within(model: EmpiricalMDP, weight: np.ndarray, rows: np.ndarray) -> np.nda
 
 
 def _multinomial(rng: np.random.Generator, visits: np.ndarray, p: sp.csr_array, rows: np.ndarray) -> np.ndarray:
-    """Counts [nnz] of visits[k] draws from each row, as binomials one entry after another."""
+    """Counts [nnz] of visits[k] draws from each row k, drawn as binomials, one entry after another."""
     counts = np.zeros(len(p.data), np.int64)
     left, mass = visits.copy(), np.ones(len(visits))
     width = np.diff(p.indptr)
