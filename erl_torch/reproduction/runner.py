@@ -1,18 +1,18 @@
-"""The runner behind ``reproduce.py``: units of work, kept one file each, and the final files made of them.
+"""The runner behind ``reproduce.py``: units of work, each kept in one file, and the final files made from them.
 
 For every artifact the folder ``<artifact>-<scale>-seed<seed>`` holds
 
-    units/NAME.npz    what ``work`` made of a unit, with the settings behind it
+    units/NAME.npz    the result of ``work`` for one unit, with the settings behind it
     NAME.csv .json    the numbers; those of others beside ours, each in the column of its source
     NAME.png .svg     the picture
 
-A unit's file is written under a temporary name and renamed, so that a run killed at any moment leaves whole units or
-none; started again, it does the missing ones. A file that is damaged, or of other settings or another version of the
-artifact, is done anew. Final files are functions of the unit files alone, with no clock in them: byte for byte the
-same, however often the run was interrupted and however many processes took part.
+A unit's file is written under a temporary name and renamed, so that a run killed at any moment leaves whole units
+only. Started again, it does the missing ones. A unit whose file is damaged, or of other settings or another version of
+the artifact, is done anew. Final files depend on the unit files alone, and have no clock in them. They are the same
+byte for byte, however often the run was interrupted and however many processes took part.
 
 An artifact is a module with an ``ARTIFACT``: see ``artifact.py`` for the interface, ``figure_4.py`` for a short
-example. Artifacts that share units (``units_of``) have them done once.
+example. Artifacts that share units (``units_of``) do them once.
 """
 
 from __future__ import annotations
@@ -21,16 +21,11 @@ import contextlib
 import csv
 import io
 import json
-import multiprocessing
-import multiprocessing.connection
-import os
 import re
-import signal
-import threading
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import matplotlib as mpl
 import numpy as np
@@ -38,7 +33,7 @@ import torch
 from omegaconf import DictConfig
 from tqdm import tqdm
 
-from erl_torch import checks
+from erl_torch import checks, parallel
 from erl_torch.checks import InputError
 from erl_torch.files import read_npz, write_bytes, write_json, write_npz
 from erl_torch.reproduction import ARTIFACTS, SCALES, load
@@ -52,12 +47,11 @@ FINGERPRINT = "fingerprint"
 class _Unit(NamedTuple):
     path: Path
     fingerprint: str
-    work: Callable[..., Any]
-    settings: dict[str, Any]
+    work: Callable[[], Mapping[str, object]]
 
 
 def reproduce(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lambda: None) -> dict[str, Output]:
-    """Run ``cfg`` (as composed from ``conf/reproduce.yaml``); prints the summary. Raises InputError."""
+    """Run ``cfg`` (as composed from ``conf/reproduce.yaml``) and print the summary. Raises InputError."""
     check_reproduction_keys(cfg)
     checks.one_of("artifact", cfg.artifact, (*ARTIFACTS, "all"))
     checks.one_of("scale", cfg.scale, SCALES)
@@ -88,18 +82,18 @@ def run(
     ``safe_point`` is called between units, and now and then while processes work; it may raise to end the run.
     """
     units = {a.name: _units(a, directory, scale, seed) for a in artifacts}
-    every = {unit.path: unit for its in units.values() for unit in its.values()}
+    every = {unit.path: unit for own in units.values() for unit in own.values()}
     done = {path for path, unit in every.items() if _kept(unit) is not None}
-    todo = [unit for path, unit in every.items() if path not in done]
+    todo = {path: unit.work for path, unit in every.items() if path not in done}
     outputs: dict[str, Output] = {}
 
     def finish() -> None:
-        """Write what has all its units."""
+        """Write the final files of every artifact whose units are all done."""
         for a in artifacts:
-            its = units[a.name]
-            if a.name in outputs or not {unit.path for unit in its.values()} <= done:
+            own = units[a.name]
+            if a.name in outputs or not {unit.path for unit in own.values()} <= done:
                 continue
-            results = {name: _kept(unit) for name, unit in its.items()}
+            results = {name: _kept(unit) for name, unit in own.items()}
             if all(result is not None for result in results.values()):
                 outputs[a.name] = a.assemble(results, scale)  # type: ignore[arg-type]
                 _write(a, outputs[a.name], _folder(directory, a.name, scale, seed), scale, seed)
@@ -109,16 +103,16 @@ def run(
         total=len(every), initial=len(done), desc="reproducing", unit=" units", disable=None,
         bar_format="{l_bar}{bar:20}| {n_fmt}/{total_fmt}{unit}, {elapsed}<{remaining}",
     ) as bar:  # fmt: skip
-        for unit, values in _each(todo, processes, safe_point):
-            write_npz(unit.path, {**values, FINGERPRINT: unit.fingerprint})
-            done.add(unit.path)
+        for path, values in parallel.results(todo, processes, safe_point):
+            write_npz(path, {**values, FINGERPRINT: every[path].fingerprint})
+            done.add(path)
             bar.update()
             finish()
     return {a.name: outputs[a.name] for a in artifacts}
 
 
-def summary(its: Artifact, output: Output) -> str:
-    """A line a comparison: what is printed, read off or computed, ours, verdict; no column that is empty."""
+def summary(artifact: Artifact, output: Output) -> str:
+    """One line per comparison: the printed, read off or computed number, ours, verdict; empty columns are left out."""
     used = {COLUMNS[c.source] for c in output.comparisons}
     columns = [name for name in dict.fromkeys(COLUMNS.values()) if name in used]
     names = ["quantity", *columns, "ours", "verdict"]
@@ -128,7 +122,7 @@ def summary(its: Artifact, output: Output) -> str:
     for quantity, *values, verdict in cells if used else []:
         aligned = [f"{value:>{width}}" for value, width in zip(values, widths[1:-1], strict=True)]
         lines.append("  ".join([f"  {quantity:{widths[0]}}", *aligned, verdict]))
-    return "\n".join([f"{its.name}: {its.title}", *lines, f"  {output.verdict}"])
+    return "\n".join([f"{artifact.name}: {artifact.title}", *lines, f"  {output.verdict}"])
 
 
 # -- units ------------------------------------------------------------------------------------------------
@@ -144,14 +138,14 @@ def _units(a: Artifact, directory: Path, scale: str, seed: int) -> dict[str, _Un
     for name, settings in a.units(scale, seed).items():
         if not re.fullmatch(r"[\w.+=-]{1,100}", name):
             raise ValueError(f"{name!r} is no name for the file of a unit")
-        # The work is named, so that artifacts that share units must mean the same by them.
+        # The name of the work is part of it, so that artifacts that share units mean the same by them.
         about = {"work": f"{a.work.__module__}.{a.work.__qualname__}", "version": a.version, "settings": settings}
-        units[name] = _Unit(folder / f"{name}.npz", json.dumps(about, sort_keys=True), a.work, settings)
+        units[name] = _Unit(folder / f"{name}.npz", json.dumps(about, sort_keys=True), partial(a.work, **settings))
     return units
 
 
 def _kept(unit: _Unit) -> dict[str, np.ndarray] | None:
-    """What the unit's file holds; None if it is missing, damaged, or of other settings."""
+    """The arrays of the unit's file; None if it is missing, damaged, or of other settings."""
     try:
         arrays = read_npz(unit.path)
     except InputError:
@@ -159,74 +153,35 @@ def _kept(unit: _Unit) -> dict[str, np.ndarray] | None:
     return arrays if str(arrays.pop(FINGERPRINT, "")) == unit.fingerprint else None
 
 
-def _each(units: list[_Unit], processes: int, safe_point: Callable[[], None]) -> Iterator[tuple[_Unit, dict[str, Any]]]:
-    """(unit, its result), as they are done."""
-    if processes == 1 or len(units) < 2:
-        for unit in units:
-            safe_point()
-            yield unit, unit.work(**unit.settings)
-        return
-    # spawn: a fork would copy the threads of torch and Numba in whatever state they are.
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(min(processes, len(units)), mp_context=context, initializer=_start_worker)
-    try:
-        futures = {pool.submit(unit.work, **unit.settings): unit for unit in units}
-        while futures:
-            ready, _ = wait(futures, timeout=0.5, return_when=FIRST_COMPLETED)
-            for future in ready:
-                yield futures.pop(future), dict(future.result())
-            safe_point()
-    except BaseException:
-        for process in multiprocessing.active_children():
-            process.terminate()
-        raise
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-def _start_worker() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends the work
-    torch.set_num_threads(1)
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def follow() -> None:
-        multiprocessing.connection.wait([parent.sentinel])
-        os._exit(1)
-
-    # A killed parent cannot end its workers, which would wait for more work for ever.
-    threading.Thread(target=follow, daemon=True).start()
-
-
 # -- final files ------------------------------------------------------------------------------------------
 
 
-def _write(its: Artifact, output: Output, folder: Path, scale: str, seed: int) -> None:
+def _write(artifact: Artifact, output: Output, folder: Path, scale: str, seed: int) -> None:
     table = io.StringIO(newline="")
     writer = csv.DictWriter(table, list(output.rows[0]), lineterminator="\n")
     writer.writeheader()
     writer.writerows(output.rows)
-    write_bytes(folder / f"{its.name}.csv", table.getvalue().encode())
+    write_bytes(folder / f"{artifact.name}.csv", table.getvalue().encode())
     for kind in ("png", "svg"):
         picture = io.BytesIO()
         # Ids by hash, no date, no version: the same picture is the same file.
         metadata = {"Software": None} if kind == "png" else {"Date": None, "Creator": None}
         with mpl.rc_context({"svg.hashsalt": "erl_torch"}):
             output.figure.savefig(picture, format=kind, dpi=DPI, metadata=metadata)
-        write_bytes(folder / f"{its.name}.{kind}", picture.getvalue())
+        write_bytes(folder / f"{artifact.name}.{kind}", picture.getvalue())
     about = {
-        "artifact": its.name,
-        "title": its.title,
-        "command": f"python reproduce.py artifact={its.name} scale={scale} seed={seed}",
+        "artifact": artifact.name,
+        "title": artifact.title,
+        "command": f"python reproduce.py artifact={artifact.name} scale={scale} seed={seed}",
         "verdict": output.verdict,
         "reading": list(output.reading),
         "comparisons": [c.row() for c in output.comparisons],
         **output.data,
     }
-    write_json(folder / f"{its.name}.json", about)
+    write_json(folder / f"{artifact.name}.json", about)
 
 
-def _cell(value: Any) -> str:
+def _cell(value: object) -> str:
     if value is None:
         return ""
     if isinstance(value, (list, tuple)):

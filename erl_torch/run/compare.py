@@ -17,13 +17,11 @@ Results other than seconds do not depend on the number of processes.
 from __future__ import annotations
 
 import contextlib
-import multiprocessing
-import signal
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +31,7 @@ import torch
 from omegaconf import DictConfig
 from tqdm import tqdm
 
-from erl_torch import checks, pictures
+from erl_torch import checks, parallel, pictures
 from erl_torch.checks import InputError
 from erl_torch.experience.collect import collect
 from erl_torch.files import read_npy, write_json, write_png
@@ -164,13 +162,13 @@ def compare(
     sizes = _sizes(n_episodes * episode_length, n_sizes)
     experience = (mdp, n_episodes, episode_length)
     jobs = {
-        (i, j): (learners[name], experience, seed, behaviour_policy, prior, sizes, best)
+        (i, j): partial(_run, learners[name], experience, seed, behaviour_policy, prior, sizes, best)
         for j, seed in enumerate(seeds)
         for i, name in enumerate(names)
     }
     measures = {name: np.full((len(names), len(seeds), len(sizes)), np.nan) for name in MEASURES}
     status = {name: [[""] * len(sizes) for _ in seeds] for name in names}
-    for done, ((i, j), rows) in enumerate(_each(jobs, processes), 1):
+    for done, ((i, j), rows) in enumerate(parallel.results(jobs, processes), 1):
         for k, (figures, ended) in enumerate(rows):
             for name in MEASURES:
                 measures[name][i, j, k] = figures[name]
@@ -196,28 +194,6 @@ def _seeds(seeds: int | Sequence[int]) -> tuple[int, ...]:
 def _sizes(n_tuples: int, n_sizes: int) -> tuple[int, ...]:
     first = min(FIRST_SIZE, n_tuples)
     return tuple(sorted({n_tuples, *np.geomspace(n_tuples, first, n_sizes).round().astype(int).tolist()}))
-
-
-def _each(jobs: dict[Any, tuple[Any, ...]], processes: int) -> Any:
-    """(key, result) of every job, as they are done."""
-    if processes == 1:
-        for key, job in jobs.items():
-            yield key, _run(*job)
-        return
-    # spawn: a fork would copy the threads of torch and Numba in whatever state they are.
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(min(processes, len(jobs)), mp_context=context, initializer=_quiet)
-    try:
-        futures = {pool.submit(_run, *job): key for key, job in jobs.items()}
-        for future in as_completed(futures):
-            yield futures[future], future.result()
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-def _quiet() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends the work
-    torch.set_num_threads(1)
 
 
 def _run(
