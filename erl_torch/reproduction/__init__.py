@@ -1,7 +1,7 @@
 """Every figure and table of the paper and its supplement, rebuilt: one module each, one runner for all.
 
-A new one is a module with an ``ARTIFACT`` (see ``artifact.py``) and its line below. This module is light: the command
-line reads the names from it before anything heavy is imported.
+A new one is a module with an ``ARTIFACT`` (see ``artifact.py``) and its line below. This module is light, because the
+command line reads the names from it before anything heavy is imported.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from erl_torch.reproduction.artifact import Artifact
 
-# name (also of the module): what it shows
+# name of the artifact and its module: what it shows
 ARTIFACTS = {
     "figure_1": "windy cliff: optimistic and optimal",
     "figure_2": "a random windy maze",
@@ -29,5 +29,5 @@ SCALES = ("quick", "full")
 
 def load(name: str) -> Artifact:
     """The artifact of that name, which is one of ``ARTIFACTS``."""
-    found: Artifact = importlib.import_module(f"erl_torch.reproduction.{name}").ARTIFACT
-    return found
+    artifact: Artifact = importlib.import_module(f"erl_torch.reproduction.{name}").ARTIFACT
+    return artifact

@@ -1,4 +1,4 @@
-"""What an artifact of the paper is to the runner, and how its numbers are held against the paper's."""
+"""The interface of an artifact of the paper to the runner, and the comparison of its numbers with the paper's."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ REPRODUCED = "reproduced"
 NOT_REPRODUCED = "not reproduced"
 NOTHING = "no number of the paper"
 VERDICTS = (NOTHING, REPRODUCED, NOT_REPRODUCED)
-AGREES, DIFFERS = "agrees", "differs"  # of what was computed: there is nothing of the paper to reproduce
+AGREES, DIFFERS = "agrees", "differs"  # verdicts on computed values, which are not the paper's to reproduce
 PRINTED = "printed"  # a number in the paper's text or tables
 PICTURE = "picture"  # read off a figure of the paper
-STATED = "stated"  # said in words
+STATED = "stated"  # in the paper's words
 ORACLE = "computed"  # not the paper's: computed independently of this package
-# source: the column that its values stand in, in print and in JSON
+# source: the column of its values, in print and in JSON
 COLUMNS = {PRINTED: "printed", STATED: "printed", PICTURE: "read off", ORACLE: "computed"}
-LEVEL = 0.95  # that all lines of one artifact and column are called reproduced, where both samples are of one law
+LEVEL = 0.95  # chance that all lines of one artifact and column are reproduced, where both samples are of one law
 
 Units = dict[str, dict[str, Any]]  # name of a unit -> keyword arguments of ``work``, as JSON takes them
 Results = dict[str, dict[str, np.ndarray]]  # name of a unit -> what ``work`` returned, as arrays
 
 
 class Comparison(NamedTuple):
-    """One number beside ours."""
+    """One number of others beside ours."""
 
     quantity: str
     reference: Any  # number, text, or list of numbers
@@ -47,14 +47,14 @@ class Comparison(NamedTuple):
 
 @dataclass(frozen=True)
 class Output:
-    """What ``assemble`` makes of the results: the same results give the same Output.
+    """The result of ``assemble``; the same results of units give the same Output.
 
     Args:
         rows: lines of the CSV file, all with the keys of the first, in its order.
         comparisons: every number of the paper, and every one computed independently, beside ours.
         figure: the picture; its title or caption names the settings.
-        reading: which reading is taken where the sources disagree, a sentence each.
-        data: more that the JSON file should hold, as JSON takes it (no NaN).
+        reading: the reading taken where the sources disagree, one sentence per question.
+        data: more for the JSON file, as JSON takes it (no NaN).
     """
 
     rows: Sequence[Mapping[str, Any]]
@@ -77,14 +77,14 @@ class Artifact:
         name: also the name of its module and files.
         title: one line.
         units: (scale, seed) -> its units of work. Their keyword arguments hold everything that the result depends on;
-            a unit of another scale with the same name and arguments has the same result. Longest first: they share
-            the cores best then.
-        work: a function of a module (it is sent to other processes by name) that turns the keyword arguments of a unit
-            into named arrays or numbers. Pure: no files but the caches of the library, no clock, nothing of the
-            process or thread it runs in.
+            a unit of another scale with the same name and arguments has the same result. List the longest first: they
+            share the cores best then.
+        work: a function of a module (other processes load it by name) that turns the keyword arguments of a unit into
+            named arrays or numbers. It is pure: it uses no files but the caches of the library, no clock, and nothing
+            of the process or thread that it runs in.
         assemble: (results of all units, scale) -> Output; quick, as it runs again at every call.
-        version: goes up whenever ``work`` makes other numbers of the same arguments.
-        units_of: the artifact that these units belong to, where two draw on the same ones; None is its own.
+        version: raise it whenever ``work`` makes other numbers from the same arguments.
+        units_of: the artifact whose units these are, where two artifacts share them; None is this one.
     """
 
     name: str
@@ -105,7 +105,7 @@ def judged(holds: bool, source: str) -> str:
 def compared(
     quantity: str, reference: float, ours: float, within: float, source: str = PRINTED, note: str = ""
 ) -> Comparison:
-    """Reproduced, or agreeing, if ``ours`` is within ``within`` of ``reference``.
+    """A comparison that holds if ``ours`` is within ``within`` of ``reference``.
 
     For numbers without chance ``within`` is half a unit of the last digit given, or the error of reading.
     """
@@ -114,7 +114,7 @@ def compared(
 
 
 def alone(lines: int) -> float:
-    """The chance that one of ``lines`` independent lines may have of failing, if all are to hold with LEVEL."""
+    """The chance of failing that each of ``lines`` independent lines may have, if all are to hold with LEVEL."""
     return 1 - float(LEVEL ** (1 / lines))
 
 
@@ -130,15 +130,15 @@ def compared_means(
     source: str = PRINTED,
     note: str = "",
 ) -> Comparison:
-    """A mean against a mean: reproduced if they differ by no more than LEVEL allows for the error of the difference.
+    """A comparison of means that holds if they differ by no more than LEVEL allows for the error of the difference.
 
     Args:
         quantity, reference, source, note: as in ``Comparison``.
         ours: our mean.
         error, reference_error: standard errors of both.
         last_digit: half a unit of the last digit given, or the error of reading; taken as uniform.
-        lines: how many numbers of this artifact and column are subject to chance; the level is at least LEVEL for
-            all together (Sidak).
+        lines: number of values of this artifact and column that are subject to chance; the level of all together is
+            at least LEVEL (Sidak).
         freedom: degrees of freedom of the standard errors (Student's t).
     """
     of_difference = float(np.sqrt(error**2 + reference_error**2 + last_digit**2 / 3))
@@ -152,13 +152,13 @@ def compared_samples(
     quantity: str, reference: float, ours: np.ndarray, n_reference: int, last_digit: float, lines: int,
     source: str = PRINTED, note: str = "",
 ) -> Comparison:  # fmt: skip
-    """As ``compared_means``: a mean of ``n_reference`` draws against our draws [n], whose deviation stands for both.
+    """As ``compared_means``: a mean of ``n_reference`` draws (1: a single draw) against our draws [n].
 
-    One draw is a mean of one.
+    The standard deviation of ours stands for both.
     """
     deviation = ours.std(ddof=1)
-    its = f"ours of {len(ours)} in [{ours.min():.4g}, {ours.max():.4g}], the other taken as of {n_reference}"
+    samples = f"ours of {len(ours)} in [{ours.min():.4g}, {ours.max():.4g}], the other taken as of {n_reference}"
     return compared_means(
         quantity, reference, ours.mean(), deviation / np.sqrt(len(ours)), deviation / np.sqrt(n_reference), last_digit,
-        lines, len(ours) - 1, source, f"{its}; {note}" if note else its,
+        lines, len(ours) - 1, source, f"{samples}; {note}" if note else samples,
     )  # fmt: skip

@@ -1,8 +1,8 @@
 """Algorithm 1 on the sampled models of the control tasks: the units that Table S2 and Figure 3 share.
 
-One biasing iteration is a dominant eigenvector y of M_V (``erl_torch.solvers.biasing``), found here by power iteration
-in the gauge, M_V y / max(M_V y) from y = 1: on Acrobot's 20,736 states an exact sparse factorisation fills in, and the
-number of power steps is one of the things that could explain the published counts.
+One biasing iteration is a dominant eigenvector y of M_V (``erl_torch.solvers.biasing``). Here it is computed by power
+iteration in the gauge, M_V y / max(M_V y) from y = 1: on Acrobot's 20,736 states an exact sparse factorisation fills
+in, and the number of power steps is one of the things that could explain the published counts.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def biasing_by_power(
     most_power_steps: int = POWER_STEPS,
     max_steps: int = MOST_ITERATIONS,
 ) -> Iterator[PowerState]:
-    """Yield every biasing iteration, until KL_TO_STOP or ``max_steps``; V += damping log(y) / beta after each."""
+    """Yield every biasing iteration, until KL_TO_STOP or ``max_steps``; after each, V += damping log(y) / beta."""
     problem = BellmanProblem.of(mdp, beta)
     prior = np.full(mdp.reward.shape, 1.0 / mdp.n_actions)
     value = np.zeros(problem.n_states)
@@ -79,9 +79,9 @@ def biasing_by_power(
 def _dominant(m: sp.csr_array) -> tuple[np.ndarray, float, int]:
     """(log y [n], log root, power steps) of M y = root y, every component to SPREAD.
 
-    After each ROUND of power steps the slowest modes are taken out by reduced rank extrapolation of its last iterates,
-    in logarithms, where every component counts by its relative change and none can turn negative; kept if that
-    narrows the Collatz-Wielandt bounds.
+    After each ROUND of power steps, reduced rank extrapolation of its last iterates removes the slowest modes. It works
+    in logarithms, where every component counts by its relative change and none can turn negative. The result is kept
+    if it narrows the Collatz-Wielandt bounds.
     """
     h, steps = np.zeros(m.shape[0]), 0
     after, gain = _power_step(m, h)

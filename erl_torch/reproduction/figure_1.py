@@ -1,4 +1,4 @@
-"""Figure 1: the windy cliff at beta 50, where the plain eigenvector's policy relies on a wind that does not come."""
+"""Figure 1: the windy cliff at beta 50, where the policy of the plain eigenvector relies on a wind that never blows."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ THETA = 0.9395271537
 REWARD_RATE = -0.914773
 OPTIMISTIC_THETA = 0.8366259
 BY_ROW = [[0, 0.0852, 0.0403], [0, 0.0994, 0.1311], [0, 0.0994, 0.1847], [0, 0.0011, 0.1852], [0, 0.0863, 0.0872]]
-TOP = 0.3  # share of time at the end of the colours
+TOP = 0.3  # share of time of the full colour
 CASES = {"optimistic": "optimistic (no bias)", "optimal": "optimal (biased)"}
 
 
@@ -43,8 +43,8 @@ def units(scale: str, seed: int) -> Units:
 def eigen_problem(mdp: TabularMDP, beta: float, log_psi: np.ndarray) -> dict[str, Any]:
     """Equation (4), uniform prior: both eigenvectors of the [S*A, S*A] tilted matrix under the biases of psi.
 
-    Returns theta (the reward biases' maximum not taken off), the policy [S, A] and the distribution [S] that u v
-    stands for: the long run of that policy in the biased dynamics.
+    Returns theta (the maximum of the reward biases is not subtracted), the policy [S, A] and the distribution [S] of
+    u v: the long run of that policy in the biased dynamics.
     """
     p, n_actions = mdp.transition, mdp.n_actions
     psi = np.exp(log_psi - log_psi.max())
@@ -68,15 +68,15 @@ def eigen_problem(mdp: TabularMDP, beta: float, log_psi: np.ndarray) -> dict[str
 
 def work(beta: float) -> dict[str, Any]:
     mdp = WindyCliffEnv().mdp
-    best = solve_soft_bellman(mdp, beta)
-    assert best.value is not None
-    result: dict[str, Any] = {"theta": best.theta}
-    for case, log_psi in {"optimistic": np.zeros(mdp.n_states), "optimal": -beta * best.value.numpy()}.items():
-        found = eigen_problem(mdp, beta, log_psi)
-        policy = found["policy"]
+    optimum = solve_soft_bellman(mdp, beta)
+    assert optimum.value is not None
+    result: dict[str, Any] = {"theta": optimum.theta}
+    for case, log_psi in {"optimistic": np.zeros(mdp.n_states), "optimal": -beta * optimum.value.numpy()}.items():
+        problem = eigen_problem(mdp, beta, log_psi)
+        policy = problem["policy"]
         chain = policy_chain(mdp, policy)
         stationary = stationary_distribution(chain.transition, mdp.start)
-        result |= {f"{case}_{name}": value for name, value in found.items()}
+        result |= {f"{case}_{name}": value for name, value in problem.items()}
         result[f"{case}_true"] = induced_distribution(mdp, policy, HORIZON)
         result[f"{case}_stationary"] = stationary
         result[f"{case}_reward_rate"] = stationary @ chain.reward
@@ -85,20 +85,20 @@ def work(beta: float) -> dict[str, Any]:
 
 
 def assemble(results: Results, scale: str) -> Output:
-    found = results["cliff"]
+    cliff = results["cliff"]
     grid = WindyCliffEnv().grid
-    ours = found["optimal_stationary"].reshape(grid.shape)
+    ours = cliff["optimal_stationary"].reshape(grid.shape)
     apart = np.abs(ours - BY_ROW).max(1)
-    gap = {case: _distance(found[f"{case}_estimated"], found[f"{case}_true"]) for case in CASES}
+    gap = {case: _distance(cliff[f"{case}_estimated"], cliff[f"{case}_true"]) for case in CASES}
     told_apart = REPRODUCED if gap["optimal"] < 0.01 < 0.1 < gap["optimistic"] else NOT_REPRODUCED
     comparisons = [
         Comparison(
             "u v is the true distribution", "optimal only",
             f"off by {gap['optimal']:.1%} (optimal), {gap['optimistic']:.1%} (optimistic)", told_apart, STATED,
         ),
-        compared("theta*", THETA, float(found["theta"]), 5e-11, ORACLE),
-        compared("theta of the optimistic problem", OPTIMISTIC_THETA, float(found["optimistic_theta"]), 5e-8, ORACLE),
-        compared("reward rate of the optimal policy", REWARD_RATE, float(found["optimal_reward_rate"]), 5e-7, ORACLE),
+        compared("theta*", THETA, float(cliff["theta"]), 5e-11, ORACLE),
+        compared("theta of the optimistic problem", OPTIMISTIC_THETA, float(cliff["optimistic_theta"]), 5e-8, ORACLE),
+        compared("reward rate of the optimal policy", REWARD_RATE, float(cliff["optimal_reward_rate"]), 5e-7, ORACLE),
         *(
             Comparison(
                 f"stationary distribution, row {i}", given, ours[i].round(4).tolist(),
@@ -111,12 +111,12 @@ def assemble(results: Results, scale: str) -> Output:
         {
             "row": s // 3, "col": s % 3, "tile": grid.tiles[s],
             **{
-                f"{case}_{what}": found[f"{case}_{what}"][s] for case in CASES
+                f"{case}_{what}": cliff[f"{case}_{what}"][s] for case in CASES
                 for what in ("estimated", "true", "stationary")
             },
             **{
                 f"{case}_{action}": p for case in CASES
-                for action, p in zip(grid.action_names, found[f"{case}_policy"][s].tolist(), strict=True)
+                for action, p in zip(grid.action_names, cliff[f"{case}_policy"][s].tolist(), strict=True)
             },
         }
         for s in range(grid.tiles.size)
@@ -129,19 +129,19 @@ def assemble(results: Results, scale: str) -> Output:
     ]
     data = {
         case: {
-            "reward_per_step_1000": float(found[f"{case}_reward_per_step"]), "theta": float(found[f"{case}_theta"]),
+            "reward_per_step_1000": float(cliff[f"{case}_reward_per_step"]), "theta": float(cliff[f"{case}_theta"]),
             "distance_of_estimated_from_true": gap[case],
         }
         for case in CASES
     }  # fmt: skip
-    return Output(rows, comparisons, _figure(found, gap), reading, data)
+    return Output(rows, comparisons, _figure(cliff, gap), reading, data)
 
 
 def _distance(p: np.ndarray, q: np.ndarray) -> float:
     return float(0.5 * np.abs(p - q).sum())
 
 
-def _figure(found: dict[str, np.ndarray], gap: dict[str, float]) -> Figure:
+def _figure(cliff: dict[str, np.ndarray], gap: dict[str, float]) -> Figure:
     grid = WindyCliffEnv().grid
     figure = Figure(figsize=(9.4, 8.2))
     figure.text(0.03, 0.97, "Figure 1: the windy cliff (beta 50)", fontsize=12, weight="bold")
@@ -162,16 +162,16 @@ def _figure(found: dict[str, np.ndarray], gap: dict[str, float]) -> Figure:
         for j, (head, what) in enumerate(panels.items()):
             axes = figure.add_axes((0.25 + 0.222 * j, bottom, 0.21, 0.36))
             if what is None:
-                draw_grid(axes, grid, found[f"{case}_policy"])
+                draw_grid(axes, grid, cliff[f"{case}_policy"])
             else:
-                share = found[f"{case}_{what}"]
+                share = cliff[f"{case}_{what}"]
                 draw_grid(axes, grid, distribution=share, top=TOP, wind=False)
                 for s in np.flatnonzero(share > 0.005):
                     colour = "white" if grid.tiles[s] == "H" else "black"
                     axes.text(s % 3 + 0.44, s // 3 + 0.4, f"{share[s]:.3f}", fontsize=7, ha="right", color=colour)
             below = {
                 "estimated": f"off by {gap[case]:.1%} (total variation)",
-                "true": f"reward a step {found[f'{case}_reward_per_step']:.4f}",
+                "true": f"reward a step {cliff[f'{case}_reward_per_step']:.4f}",
             }.get(what or "", "")
             axes.text(1, 4.62, below, fontsize=8, ha="center", va="top")
             axes.set_title(head, fontsize=9.5)

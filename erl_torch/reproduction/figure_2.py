@@ -1,4 +1,4 @@
-"""Figure 2: a random windy maze solved; the policy meets that of soft policy iteration."""
+"""Figure 2: a random windy maze; the policy of biasing iterations becomes that of soft policy iteration."""
 
 from __future__ import annotations
 
@@ -38,18 +38,18 @@ def units(scale: str, seed: int) -> Units:
 
 def work(maze_seed: int) -> dict[str, Any]:
     mdp = random_maze(SIZE, TRAPS, wind_level=WIND_LEVEL, seed=maze_seed).mdp()
-    best = solve_optimum(mdp, BETA)  # soft policy iteration
-    kl, policy = [], best.policy
+    optimum = solve_optimum(mdp, BETA)  # soft policy iteration
+    kl, policy = [], optimum.policy
     for state in iterate_biasing(mdp, BETA, max_steps=ITERATIONS):
         # All states of a maze can be reached from its start.
-        kl.append(np.maximum(kl_per_state(state.policy, best.policy), 0.0))
+        kl.append(np.maximum(kl_per_state(state.policy, optimum.policy), 0.0))
         policy = state.policy
     kl += kl[-1:] * (ITERATIONS - len(kl))  # ended by rounding
     return {"policy": policy, "distribution": induced_distribution(mdp, policy, HORIZON), "kl": np.array(kl)}
 
 
 def assemble(results: Results, scale: str) -> Output:
-    shown = next(iter(results))
+    first = next(iter(results))
     kl = np.array([result["kl"] for result in results.values()])  # [mazes, iterations, S]
     worst, mean = kl.max(2), kl.mean(2)
     rows = [
@@ -64,7 +64,7 @@ def assemble(results: Results, scale: str) -> Output:
             f"at most {end:.1e} in {len(results)} mazes", verdict, STATED, ROUNDING,
         )
     ]  # fmt: skip
-    maze_seed = int(shown.removeprefix("maze"))
+    maze_seed = int(first.removeprefix("maze"))
     reading = [
         "The authors' own maze is not known: a maze of the same law, drawn by this package's generator, is shown, and "
         f"{len(results)} of them are measured.",
@@ -72,10 +72,10 @@ def assemble(results: Results, scale: str) -> Output:
         "iteration || ground truth) in nats, over all states.",
         "10 traps (not a density), no trap within one tile of S and G; trap -2; one first wind angle from [0, 2 pi].",
     ]
-    return Output(rows, comparisons, _figure(results[shown], maze_seed, worst, mean), reading)
+    return Output(rows, comparisons, _figure(results[first], maze_seed, worst, mean), reading)
 
 
-def _figure(found: dict[str, np.ndarray], maze_seed: int, worst: np.ndarray, mean: np.ndarray) -> Figure:
+def _figure(result: dict[str, np.ndarray], maze_seed: int, worst: np.ndarray, mean: np.ndarray) -> Figure:
     grid = random_maze(SIZE, TRAPS, wind_level=WIND_LEVEL, seed=maze_seed)
     figure = Figure(figsize=(9.8, 8.6))
     figure.text(0.03, 0.967, f"Figure 2: a random windy maze (beta {BETA:g})", fontsize=12, weight="bold")
@@ -85,14 +85,14 @@ def _figure(found: dict[str, np.ndarray], maze_seed: int, worst: np.ndarray, mea
     )  # fmt: skip
     panels: list[tuple[str, dict[str, Any]]] = [
         (f"maze {maze_seed} and its wind", {}),
-        ("optimal policy", {"policy": found["policy"], "wind": False}),
-        ("induced distribution", {"distribution": found["distribution"], "wind": False}),
+        ("optimal policy", {"policy": result["policy"], "wind": False}),
+        ("induced distribution", {"distribution": result["distribution"], "wind": False}),
     ]
     for i, (title, content) in enumerate(panels):
         axes = figure.add_axes((0.03 + 0.47 * (i % 2), 0.49 - 0.47 * (i // 2), 0.42, 0.41))
         draw_grid(axes, grid, **content)
         axes.set_title(title, fontsize=10)
-    top = float(found["distribution"].max())
+    top = float(result["distribution"].max())
     bar = figure.colorbar(shares(top), cax=figure.add_axes((0.455, 0.08, 0.01, 0.3)))
     bar.set_label("share of time", fontsize=8)
     bar.ax.tick_params(labelsize=7)

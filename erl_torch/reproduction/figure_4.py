@@ -1,7 +1,6 @@
-"""Figure 4: the action "up" breaks, and the new solution is found from the old one.
+"""Figure 4: the action "up" breaks, and the new solution is computed from the old one.
 
-Two readings of how often "up" still works: 1e-4, with which the published figure was made, and .01, in the authors'
-later script.
+"up" still works with probability 1e-4, as in the published figure, or .01, as in the authors' later script.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from erl_torch.reproduction.artifact import ORACLE, Artifact, Comparison, Output
 from erl_torch.solvers.policy import induced_distribution, reward_per_step
 
 HORIZON = 1000
-TOP = 0.4  # share of time at the end of the colours
+TOP = 0.4  # share of time of the full colour
 # 1000-step returns: of the old policy after the shift, and of the new one
 RETURNS = {"1e-4": (-1000.00, -946.76), "0.01": (-997.14, -947.14)}
 ORIGINAL = -756.59
@@ -30,12 +29,12 @@ def units(scale: str, seed: int) -> Units:
 def work(beta: float, up_success: float) -> dict[str, Any]:
     before, after = (grid.mdp() for grid in dynamics_shift(up_success))
     old = solve_soft_bellman(before, beta).policy.numpy()
-    # Started from the old solution: its iteration 0 solves the old problem.
-    found = solve_biasing(before, beta, target=after)
-    new = found.policy.numpy()
+    # Iteration 0 solves the old problem: the old solution is the start.
+    solution = solve_biasing(before, beta, target=after)
+    new = solution.policy.numpy()
     cases = {"original": (before, old), "old_after": (after, old), "new": (after, new)}
-    assert found.theta_bounds is not None
-    result: dict[str, Any] = {"theta_bounds": found.theta_bounds, "n_iterations": found.n_steps, "k": found.k}
+    assert solution.theta_bounds is not None
+    result: dict[str, Any] = {"theta_bounds": solution.theta_bounds, "n_iterations": solution.n_steps, "k": solution.k}
     for name, (mdp, policy) in cases.items():
         result[f"{name}_policy"] = policy
         result[f"{name}_return"] = HORIZON * reward_per_step(mdp, policy, HORIZON)
@@ -58,25 +57,25 @@ def assemble(results: Results, scale: str) -> Output:
         "up works with .99 before, with the probability on the left after", fontsize=8, color="#555555",
     )  # fmt: skip
     for i, chance in enumerate(RETURNS):
-        found = results[f"up-{chance}"]
+        result = results[f"up-{chance}"]
         wanted = dict(zip(titles, (ORIGINAL, *RETURNS[chance]), strict=True))
         grids = dynamics_shift(float(chance))
         for j, (name, title) in enumerate(titles.items()):
-            value = float(found[f"{name}_return"])
+            value = float(result[f"{name}_return"])
             if i == 0 or name != "original":
                 label = "return of the original policy" if name == "original" else f"{title}, up {chance}"
                 comparisons.append(compared(label, wanted[name], value, 0.005, ORACLE))
             rows.extend(
                 {
                     "up_success": float(chance), "case": name, "return_1000_steps": value, "row": s // 4, "col": s % 4,
-                    "tile": grids.before.tiles[s], "share_of_time": found[f"{name}_distribution"][s],
-                    **dict(zip(grids.before.action_names, found[f"{name}_policy"][s].tolist(), strict=True)),
+                    "tile": grids.before.tiles[s], "share_of_time": result[f"{name}_distribution"][s],
+                    **dict(zip(grids.before.action_names, result[f"{name}_policy"][s].tolist(), strict=True)),
                 }
                 for s in range(16)
             )  # fmt: skip
             axes = figure.add_axes((0.06 + 0.288 * j, 0.5 - 0.46 * i, 0.27, 0.36))
             grid = grids.before if name == "original" else grids.after
-            draw_grid(axes, grid, found[f"{name}_policy"], found[f"{name}_distribution"], TOP)
+            draw_grid(axes, grid, result[f"{name}_policy"], result[f"{name}_distribution"], TOP)
             axes.set_title(f"{title}\nreturn {value:.2f}", fontsize=9.5)
         figure.text(0.022, 0.68 - 0.46 * i, f"up works with {chance}", rotation=90, va="center", fontsize=10)
     bar = figure.colorbar(shares(TOP), cax=figure.add_axes((0.925, 0.12, 0.012, 0.66)), extend="max")

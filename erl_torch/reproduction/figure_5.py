@@ -1,4 +1,4 @@
-"""Figure 5: Algorithm S1 on the windy cliff, replicas of the published run; and what the same data allow."""
+"""Figure 5: Algorithm S1 on the windy cliff, replicas of the published run; and other learners on the same data."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ REPLICAS = {"quick": 4, "full": 40}
 PUBLISHED = [(-1.29, 5e-3), (-0.985, 5e-4), (-0.957, 5e-4), (-0.966, 5e-4), (-0.966, 5e-4)]
 PUBLISHED_REPLICAS = 5  # the default of the authors' plotting function
 PUBLISHED_PRIOR, PUBLISHED_OPTIMAL = -1.626, -0.956
-# and half a unit of the last digit
+# max |V - V*| after each exact iteration, and half a unit of the last digit
 EXACT_VALUE_ERRORS = [(0.31, 5e-3), (0.085, 5e-4), (0.015, 5e-4), (7.7e-4, 5e-6), (2.2e-6, 5e-8), (2e-11, 5e-12)]
-# Loss g* - J, mean over STREAMS streams of the same length; which of our learners it is, half a unit of the last digit.
+# Our learner, its loss g* - J as a mean over STREAMS streams of the same length, and half a unit of the last digit.
 STREAMS = 6
 GAPS = {
     "s1": ("Algorithm S1", 2.4e-3, 5e-5),
@@ -59,12 +59,12 @@ def units(scale: str, seed: int) -> Units:
 def work(
     beta: float, n_episodes: int, episode_length: int, lr_u: float, lr_psi: float, n_epochs: int, n_bias: int, seed: int
 ) -> dict[str, Any]:
-    """One stream: Algorithm S1 epoch by epoch, the improved learner likewise, and what others end at.
+    """One stream: Algorithm S1 and the improved learner after each epoch, and the end of others.
 
-    ``reward`` and ``objective`` are [n_bias, n_epochs] of S1's policies; ``efficient_*`` [passes].
+    ``reward`` and ``objective`` are [n_bias, n_epochs], of S1's policies; ``efficient_*`` are [passes].
     """
     mdp = WindyCliffEnv().mdp
-    best = solve_optimum(mdp, beta)
+    optimum = solve_optimum(mdp, beta)
     prior = np.full_like(mdp.reward, 1 / mdp.n_actions)
     data = collect(mdp, n_episodes, episode_length, seed)
     sizes = mdp.n_states, mdp.n_actions
@@ -92,10 +92,10 @@ def work(
         "certainty_equivalence": CertaintyEquivalence(beta),
         "soft_q": DifferentialSoftQ(beta=beta, power=0.6, n_epochs=1),
     }
-    result["s1_gap"] = measure(mdp, best, learner.solution(states[-1]), beta)["gap"]
+    result["s1_gap"] = measure(mdp, optimum, learner.solution(states[-1]), beta)["gap"]
     for name, other in others.items():
         solution = other.fit(data, *sizes)
-        result[f"{name}_gap"] = measure(mdp, best, solution, beta)["gap"]
+        result[f"{name}_gap"] = measure(mdp, optimum, solution, beta)["gap"]
         if name == "certainty_equivalence":
             result["ce_reward"], result["ce_objective"] = worth(solution.policy.numpy())
     return result
@@ -104,16 +104,16 @@ def work(
 def references() -> dict[str, Any]:
     """Exact values: optimum, prior, and the policies of exact biasing iterations."""
     mdp = WindyCliffEnv().mdp
-    best = solve_optimum(mdp, BETA)
+    optimum = solve_optimum(mdp, BETA)
     prior = np.full_like(mdp.reward, 1 / mdp.n_actions)
     states = list(iterate_biasing(mdp, BETA, max_steps=N_BIAS + 2))
     end = states[-1].value
     # V is known up to a constant: both with mean 0.
     errors = [float(np.abs((v := state.value - end) - v.mean()).max()) for state in states[:N_BIAS]]
     return {
-        "theta": best.theta,
-        "optimal": reward_per_step(mdp, best.policy, HORIZON),
-        "optimal_rate": float(best.stationary @ (best.policy * mdp.reward).sum(1)),
+        "theta": optimum.theta,
+        "optimal": reward_per_step(mdp, optimum.policy, HORIZON),
+        "optimal_rate": float(optimum.stationary @ (optimum.policy * mdp.reward).sum(1)),
         "prior": reward_per_step(mdp, prior, HORIZON),
         "prior_objective": objective(mdp, prior, prior, BETA),
         "iterations": [reward_per_step(mdp, state.policy, HORIZON) for state in states[:N_BIAS]],
@@ -161,7 +161,7 @@ def assemble(results: Results, scale: str) -> Output:
 
 
 def _statistics(reward: np.ndarray, j: np.ndarray) -> dict[str, float]:
-    """Over replicas [R]."""
+    """Mean, extremes and quantiles over replicas [R]."""
     return {
         f"{name}_{what}": float(find(values))
         for name, values in (("reward_per_step", reward), ("objective", j))
@@ -173,7 +173,7 @@ def _statistics(reward: np.ndarray, j: np.ndarray) -> dict[str, float]:
 
 
 def _improved(results: Results, name: str) -> np.ndarray:
-    """[R, passes] of the improved learner; where a run was certified and ended, its policy stands."""
+    """[R, passes] of the improved learner; where a run ended early, certified, its last policy is repeated."""
     curves = [r[f"efficient_{name}"] for r in results.values()]
     longest = max(map(len, curves))
     return np.array([np.pad(curve, (0, longest - len(curve)), "edge") for curve in curves])
@@ -181,11 +181,11 @@ def _improved(results: Results, name: str) -> np.ndarray:
 
 def _comparisons(results: Results, ends: np.ndarray, exact: dict[str, Any]) -> list[Comparison]:
     names = ["optimistic, #0", *(f"#{k}" for k in range(1, 5))]
-    found = [
+    comparisons = [
         compared_samples(f"end of {name}", published, ends[:, k], PUBLISHED_REPLICAS, digit, len(PUBLISHED), PICTURE)
         for k, (name, (published, digit)) in enumerate(zip(names, PUBLISHED, strict=True))
     ]
-    found += [
+    comparisons += [
         compared("prior policy", PUBLISHED_PRIOR, exact["prior"], 5e-4, PICTURE),
         compared("optimal policy", PUBLISHED_OPTIMAL, exact["optimal"], 5e-4, PICTURE),
         compared("theta*", 1.0101363366, exact["theta"], 5e-11, ORACLE),
@@ -195,16 +195,18 @@ def _comparisons(results: Results, ends: np.ndarray, exact: dict[str, Any]) -> l
         compared("exact iteration 0, 1000 steps", -1.3221561, exact["iterations"][0], 5e-8, ORACLE),
         compared("exact iteration 1, stationary", -0.94197, exact["iteration_rates"][1], 5e-6, ORACLE),
     ]
-    found += [
+    comparisons += [
         compared(f"exact iteration {k}: error of V", wanted, ours, digit, ORACLE)
         for k, ((wanted, digit), ours) in enumerate(zip(EXACT_VALUE_ERRORS, exact["value_errors"], strict=True))
     ]
     theta = np.array([r["theta"][-1] for r in results.values()])
-    found.append(compared_samples("theta of the last iteration", 1.0161, theta, STREAMS, 5e-5, len(GAPS) + 1, ORACLE))
+    comparisons.append(
+        compared_samples("theta of the last iteration", 1.0161, theta, STREAMS, 5e-5, len(GAPS) + 1, ORACLE)
+    )
     for name, (title, gap, digit) in GAPS.items():
         ours = np.array([float(r[f"{name}_gap"]) for r in results.values()])
-        found.append(compared_samples(f"loss g* - J: {title}", gap, ours, STREAMS, digit, len(GAPS) + 1, ORACLE))
-    return found
+        comparisons.append(compared_samples(f"loss g* - J: {title}", gap, ours, STREAMS, digit, len(GAPS) + 1, ORACLE))
+    return comparisons
 
 
 def _figure(results: Results, reward: np.ndarray, j: np.ndarray, exact: dict[str, Any]) -> Figure:
@@ -259,13 +261,13 @@ def _curves(axes: Axes, values: np.ndarray, iterations: range) -> None:
         axes.plot(epochs, values[:, k].mean(0), color=COLOURS[k], linewidth=1.6, label=name)
 
 
-def _gaps(axes: Axes, results: Results, j: np.ndarray, best: float) -> None:
+def _gaps(axes: Axes, results: Results, j: np.ndarray, g_star: float) -> None:
     """Loss against passes over the data, of S1 and of the improved learner."""
     for values, colour, name in (
         (j.reshape(len(j), -1), COLOURS[0], "Algorithm S1, as published"),
         (_improved(results, "objective"), COLOURS[2], f"{EFFICIENT} (s1_efficient)"),
     ):
-        loss = np.maximum(best - values, 1e-12)
+        loss = np.maximum(g_star - values, 1e-12)
         passes = np.arange(1, loss.shape[1] + 1)
         low, high = np.quantile(loss, QUANTILES, axis=0)
         axes.fill_between(passes, low, high, color=colour, alpha=0.15, linewidth=0)

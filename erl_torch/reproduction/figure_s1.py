@@ -1,10 +1,9 @@
-"""Figure S1: how the counts of Table S1 are spread, by size, wind level, beta and trap density."""
+"""Figure S1: the distribution of the counts of Table S1, by size, wind level, beta and trap density."""
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
@@ -22,7 +21,7 @@ from erl_torch.reproduction.mazes import count_cell
 from erl_torch.reproduction.table_s1 import BETAS, CELLS, DENSITIES, MAZES, SIZES, WIND_LEVELS, Cell, units
 
 DROPPED_FROM = 50  # counts that the figure leaves out
-SMOOTH = 0.3  # iterations, of the violins
+SMOOTH = 0.3  # iterations, width of the kernel of the violins
 MOST = (2, 6)  # "most of the mazes required between 2 and 6"
 
 
@@ -37,12 +36,12 @@ def assemble(results: Results, scale: str) -> Output:
 
 
 def _comparisons(counts: dict[Cell, np.ndarray]) -> list[Comparison]:
-    def mean(**its: Any) -> float:
-        chosen = [k for cell, k in counts.items() if all(getattr(cell, key) == v for key, v in its.items())]
+    def mean(**keys: float) -> float:
+        chosen = [k for cell, k in counts.items() if keys.items() <= cell._asdict().items()]
         return float(np.concatenate(chosen).mean())
 
-    def comparison(said: str, ours: str, holds: bool) -> Comparison:
-        return Comparison(said, "in words", ours, REPRODUCED if holds else NOT_REPRODUCED, STATED)
+    def comparison(statement: str, ours: str, holds: bool) -> Comparison:
+        return Comparison(statement, "in words", ours, REPRODUCED if holds else NOT_REPRODUCED, STATED)
 
     every = np.concatenate(list(counts.values()))
     share = np.mean((every >= MOST[0]) & (every <= MOST[1]))
@@ -81,14 +80,14 @@ def _figure(counts: dict[Cell, np.ndarray], scale: str) -> Figure:
         0.055, 0.942, f"{MAZES[scale]} mazes a violin (smoothed over {SMOOTH} iterations), eigenvectors converged; "
         "bar: mean, thin line: least to largest", fontsize=8, color="#555555",
     )  # fmt: skip
-    shown = {cell: k[k < DROPPED_FROM] for cell, k in counts.items()}
-    top = max(int(k.max()) for k in shown.values())
+    kept = {cell: k[k < DROPPED_FROM] for cell, k in counts.items()}
+    top = max(int(k.max()) for k in kept.values())
     colours = [COLOURS[4], COLOURS[0], COLOURS[5], COLOURS[1]]
     for i, size in enumerate(SIZES):
         for j, level in enumerate(WIND_LEVELS):
             axes = figure.add_axes((0.055 + 0.315 * j, 0.655 - 0.29 * i, 0.3, 0.245))
             for d, density in enumerate(DENSITIES):
-                k = [shown[Cell(size, density, level, beta)] for beta in BETAS]
+                k = [kept[Cell(size, density, level, beta)] for beta in BETAS]
                 at = np.arange(len(BETAS)) + (d - 1.5) * 0.2
                 _violins(axes, k, at, colours[d])
             axes.set_ylim(0, top + 1)
@@ -111,7 +110,7 @@ def _figure(counts: dict[Cell, np.ndarray], scale: str) -> Figure:
     return figure
 
 
-def _violins(axes: Any, samples: list[np.ndarray], at: np.ndarray, colour: str) -> None:
+def _violins(axes: Axes, samples: list[np.ndarray], at: np.ndarray, colour: str) -> None:
     """Violins of whole numbers: half-widths are shares of the mazes, smoothed over SMOOTH."""
     for k, x in zip(samples, at, strict=True):
         y = np.linspace(k.min() - 0.9, k.max() + 0.9, 30 * int(np.ptp(k) + 2))

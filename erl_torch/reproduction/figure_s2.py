@@ -20,7 +20,7 @@ def units(scale: str, seed: int) -> Units:
 
 def work(task: str, seed: int) -> dict[str, Any]:
     """The picture [H, W, 3] of a first state."""
-    os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # nothing is shown: no display is looked for
+    os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # there need not be a display
     env = gym.make(control_task(task).gymnasium_id, render_mode="rgb_array")
     env.reset(seed=seed)
     picture = np.asarray(env.render(), dtype=np.uint8)
@@ -33,17 +33,19 @@ def assemble(results: Results, scale: str) -> Output:
     figure.text(0.02, 0.93, "Figure S2: the control tasks", fontsize=12, weight="bold")
     rows = []
     for i, (task, name) in enumerate(TASKS.items()):
-        its = control_task(task)
+        control = control_task(task)
         axes = figure.add_axes((0.02 + 0.245 * i, 0.03, 0.23, 0.68))
         axes.imshow(results[task]["picture"])
         axes.set_axis_off()
         axes.set_title(
-            f"({'abcd'[i]}) {name}\n{its.bins[0]}^{len(its.bins)} cells, {len(its.actions)} actions", fontsize=9
+            f"({'abcd'[i]}) {name}\n{control.bins[0]}^{len(control.bins)} cells, {len(control.actions)} actions",
+            fontsize=9,
         )
         rows.append(
             {
-                "environment": name, "gymnasium_id": its.gymnasium_id, "cells": int(np.prod(its.bins)),
-                "actions": len(its.actions), "beta": its.beta, "low": list(its.low), "high": list(its.high),
+                "environment": name, "gymnasium_id": control.gymnasium_id, "cells": int(np.prod(control.bins)),
+                "actions": len(control.actions), "beta": control.beta, "low": list(control.low),
+                "high": list(control.high),
             }
         )  # fmt: skip
     reading = [

@@ -1,5 +1,5 @@
-"""Biasing iterations of random mazes, counted with exact eigenvectors, and as the authors' script counts them: with
-power iterations that may not have converged."""
+"""Count the biasing iterations of random mazes, with exact eigenvectors, and as the authors' script does: with power
+iterations that may not have converged."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Count(NamedTuple):
 def count_by_power_iteration(
     mdp: TabularMDP, beta: float, power_steps: int = POWER_STEPS, tolerance: float = POWER_TOLERANCE
 ) -> Count:
-    """Algorithm 1 with plain power iterations, each begun from ones and ended by the authors' rule or cap.
+    """Count by Algorithm 1 with plain power iterations, each begun from ones and ended by the authors' rule or cap.
 
     Args:
         mdp: every state reachable from its start.
@@ -47,7 +47,7 @@ def count_by_power_iteration(
         )
         n_capped += not converged
         if not (np.isfinite(chi).all() and chi.min() > 0):
-            break  # from here on NaN, which passes no test
+            break  # all that follows is NaN, which passes no test
         log_chi = np.log(chi)
         if problem.tilt(log_chi + log_psi)[1].max() < KL_TOLERANCE:
             return Count(k, n_capped)
@@ -67,10 +67,10 @@ def count_cell(
     power_k, power_capped = np.empty(n_power, np.int16), np.empty(n_power, np.int16)
     for i, grid in enumerate(grids):
         mdp = grid.mdp()
-        found = solve_biasing(mdp, beta, max_steps=MAX_ITERATIONS, stop="kl")
-        if found.k is None:
-            raise ArithmeticError(f"maze {i} of seed {seed}: {found.status.name}, {found.message}")
-        k[i] = found.k
+        solution = solve_biasing(mdp, beta, max_steps=MAX_ITERATIONS, stop="kl")
+        if solution.k is None:
+            raise ArithmeticError(f"maze {i} of seed {seed}: {solution.status.name}, {solution.message}")
+        k[i] = solution.k
         if i < n_power:
             power_k[i], power_capped[i] = count_by_power_iteration(mdp, beta)
     return {"k": k, "power_k": power_k, "power_capped": power_capped}

@@ -1,13 +1,14 @@
 """Table S1: biasing iterations of 19,440 random windy mazes, every eigenvector converged.
 
-A cell is a size, a number of traps for each row length, a wind level and a beta; each has mazes of its own. Beside the
+A cell is a size, a number of traps per row length, a wind level and a beta; each cell has mazes of its own. Beside the
 exact counts stand those of the authors' rule, power iterations cut off after 1000 steps, on the first mazes of every
-cell and on all mazes of the cells with the longest counts: the same mazes, so that what differs is the eigenvectors.
+cell and on all mazes of the cells with the longest counts. These are the same mazes, so that only the eigenvectors
+differ.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -34,11 +35,11 @@ SIZES = (10, 20, 30)
 DENSITIES = (0.10, 0.15, 0.20, 0.25)
 WIND_LEVELS = (1.0, 2.0, 4.0)
 BETAS = (2.0, 5.0, 20.0, 50.0)
-MAZES = {"quick": 8, "full": 135}  # a cell
+MAZES = {"quick": 8, "full": 135}  # per cell
 POWER_MAZES = {"quick": 1, "full": 5}
 # Cells of long counts, where the authors' rule counts every maze at full scale.
 ALL_BY_POWER = [(30, 0.25, 4.0, 50.0), (30, 0.25, 4.0, 20.0), (20, 0.25, 4.0, 50.0)]
-PUBLISHED_MAZES = 135  # a cell
+PUBLISHED_MAZES = 135  # per cell
 LAST_DIGIT = 0.005
 # (mean, three largest), as published
 PUBLISHED = {
@@ -72,14 +73,14 @@ CELLS = [Cell(*cell) for cell in product(SIZES, DENSITIES, WIND_LEVELS, BETAS)]
 
 
 def units(scale: str, seed: int) -> Units:
-    its = {}
+    cells = {}
     for i, cell in enumerate(CELLS):
         n = MAZES[scale]
         n_power = n if scale == "full" and cell in ALL_BY_POWER else POWER_MAZES[scale]
         # Seeds of their own: equal ones would give the cells the same winds.
-        its[cell.name] = {**cell._asdict(), "n": n, "n_power": n_power, "seed": len(CELLS) * seed + i}
-    # The longest first: the largest, and of these the ones counted by power iteration throughout.
-    return dict(sorted(its.items(), key=lambda item: (-item[1]["size"], -item[1]["n_power"], -item[1]["beta"])))
+        cells[cell.name] = {**cell._asdict(), "n": n, "n_power": n_power, "seed": len(CELLS) * seed + i}
+    # The longest first: the largest mazes, and of these the cells where power iteration counts every maze.
+    return dict(sorted(cells.items(), key=lambda item: (-item[1]["size"], -item[1]["n_power"], -item[1]["beta"])))
 
 
 def assemble(results: Results, scale: str) -> Output:
@@ -112,8 +113,8 @@ class _Group(NamedTuple):
     k: np.ndarray  # [n]
     power: np.ndarray  # [m], by power iteration
     of_power: np.ndarray  # [m], exact counts of the same mazes
-    error: float  # standard error of the mean, the cells' means being fixed
-    published_error: float  # the same for the published mazes of a cell, the deviations being ours
+    error: float  # standard error of the mean, for given means of the cells
+    published_error: float  # the same for the published number of mazes, with our deviations
 
     @property
     def largest(self) -> list[int]:
@@ -121,12 +122,12 @@ class _Group(NamedTuple):
 
 
 def _group(size: int, density: float, results: Results) -> _Group:
-    its = [results[cell.name] for cell in CELLS if cell[:2] == (size, density)]
-    k = np.concatenate([r["k"] for r in its]).astype(int)
-    power = np.concatenate([r["power_k"] for r in its]).astype(int)
-    of_power = np.concatenate([r["k"][: len(r["power_k"])] for r in its]).astype(int)
-    variance = sum(len(r["k"]) * r["k"].var(ddof=1) for r in its) / len(k) ** 2
-    published = np.mean([r["k"].var(ddof=1) for r in its]) / (len(its) * PUBLISHED_MAZES)
+    cells = [results[cell.name] for cell in CELLS if cell[:2] == (size, density)]
+    k = np.concatenate([r["k"] for r in cells]).astype(int)
+    power = np.concatenate([r["power_k"] for r in cells]).astype(int)
+    of_power = np.concatenate([r["k"][: len(r["power_k"])] for r in cells]).astype(int)
+    variance = sum(len(r["k"]) * r["k"].var(ddof=1) for r in cells) / len(k) ** 2
+    published = np.mean([r["k"].var(ddof=1) for r in cells]) / (len(cells) * PUBLISHED_MAZES)
     return _Group(k, power, of_power, float(np.sqrt(variance)), float(np.sqrt(published)))
 
 
@@ -250,7 +251,7 @@ def _table(axes: Axes, groups: dict[tuple[int, float], _Group]) -> None:
             )  # fmt: skip
 
 
-def _listed(largest: Any) -> str:
+def _listed(largest: Iterable[int]) -> str:
     return ", ".join(str(k) for k in largest)
 
 
@@ -258,15 +259,15 @@ def _draw_means(axes: Axes, groups: dict[tuple[int, float], _Group]) -> None:
     for i, size in enumerate(SIZES):
         x = 5 * i + np.arange(len(DENSITIES))
         published = [PUBLISHED[size, density][0] for density in DENSITIES]
-        its = [groups[size, density] for density in DENSITIES]
-        errors = [1.96 * g.published_error for g in its]
+        row = [groups[size, density] for density in DENSITIES]
+        errors = [1.96 * g.published_error for g in row]
         axes.errorbar(x, published, errors, fmt="none", ecolor="#cccccc", elinewidth=7, zorder=1)
         axes.plot(
             x, published, "_", color="#222222", markersize=11,
             label="published (grey: 95 %, by our deviations)" if i == 0 else None,
         )  # fmt: skip
         axes.errorbar(
-            x, [g.k.mean() for g in its], [1.96 * g.error for g in its], fmt="o", color=COLOURS[0], markersize=4,
+            x, [g.k.mean() for g in row], [1.96 * g.error for g in row], fmt="o", color=COLOURS[0], markersize=4,
             elinewidth=1.3, zorder=3, label="ours, 95 % interval" if i == 0 else None,
         )  # fmt: skip
         axes.text(x.mean(), 1.01, f"size {size}", ha="center", fontsize=8.5, transform=axes.get_xaxis_transform())

@@ -1,4 +1,4 @@
-"""Table S2: how many biasing iterations the discretised control tasks take, and what could explain the published k.
+"""Table S2: the number of biasing iterations of the discretised control tasks, and what could explain the published k.
 
 k counts eigen-solves, the first included. The published counts follow from neither published script; the scan here
 varies everything that a count depends on: the stop rule and its threshold, counting from 0 or 1, the damping of the
@@ -81,15 +81,15 @@ def published_units(scale: str, seed: int) -> Units:
 
 
 def units(scale: str, seed: int) -> Units:
-    its = published_units(scale, seed)
+    units = published_units(scale, seed)
     if scale == "full":
         for task in reversed(TASKS):
             small = task != "acrobot"
             base = {"task": task, "n_samples": SAMPLES, "seed": seed}
             more = SEEDS if small else ACROBOT_SEEDS
-            its |= {f"{task}-sample{i}": base | {"seed": seed + i} for i in range(1, more)}
-            its |= {f"{task}-{name}": base | change for name, change in SCAN.items() if small or name in ACROBOT_SCAN}
-    return its
+            units |= {f"{task}-sample{i}": base | {"seed": seed + i} for i in range(1, more)}
+            units |= {f"{task}-{name}": base | change for name, change in SCAN.items() if small or name in ACROBOT_SCAN}
+    return units
 
 
 def solves(result: dict[str, np.ndarray], rule: str) -> int | None:
@@ -100,44 +100,44 @@ def solves(result: dict[str, np.ndarray], rule: str) -> int | None:
 
 
 def assemble(results: Results, scale: str) -> Output:
-    found: dict[str, dict[str, dict[str, np.ndarray]]] = {task: {} for task in TASKS}
+    by_task: dict[str, dict[str, dict[str, np.ndarray]]] = {task: {} for task in TASKS}
     for name, result in results.items():
         task, variant = name.split("-", 1)
-        found[task][variant] = result
+        by_task[task][variant] = result
     rows = [
         {
             "environment": TASKS[task], "variant": variant, "rule": rule, "solves": count,
             "bias_updates": None if count is None else count - 1, "published_k": PUBLISHED[task],
         }
-        for task in TASKS for variant, result in found[task].items()
+        for task in TASKS for variant, result in by_task[task].items()
         for rule in RULES for count in [solves(result, rule)]
     ]  # fmt: skip
-    fits = _fits(found)
-    comparisons = [c for task in TASKS for c in _comparisons(task, found[task])]
+    fits = _fits(by_task)
+    comparisons = [c for task in TASKS for c in _comparisons(task, by_task[task])]
     best = [
         {"setting": name, "counts": counts, "sum_of_differences": difference} for difference, name, counts in fits[:5]
     ]
-    return Output(rows, comparisons, _figure(found, scale), _reading(fits, found), {"closest_settings": best})
+    return Output(rows, comparisons, _figure(by_task, scale), _reading(fits, by_task), {"closest_settings": best})
 
 
-def _fits(found: dict[str, dict[str, Any]]) -> list[tuple[int, str, list[int]]]:
+def _fits(by_task: dict[str, dict[str, Any]]) -> list[tuple[int, str, list[int]]]:
     """(sum of differences from the published counts, setting, its counts), closest first."""
-    shared = [v for v in found["pendulum"] if all(v in of for of in found.values())]
+    shared = [v for v in by_task["pendulum"] if all(v in of for of in by_task.values())]
     fits = []
     for variant in shared:
         for rule in RULES:
             for origin in (1, 0):
-                counts = [solves(found[task][variant], rule) for task in TASKS]
+                counts = [solves(by_task[task][variant], rule) for task in TASKS]
                 if None in counts:
                     continue
-                shown = [count - 1 + origin for count in counts if count is not None]
-                apart = sum(abs(c - k) for c, k in zip(shown, PUBLISHED.values(), strict=True))
-                fits.append((apart, f"{variant}, {rule}, counted from {origin}", shown))
+                numbers = [count - 1 + origin for count in counts if count is not None]
+                apart = sum(abs(c - k) for c, k in zip(numbers, PUBLISHED.values(), strict=True))
+                fits.append((apart, f"{variant}, {rule}, counted from {origin}", numbers))
     return sorted(fits)
 
 
 def _comparisons(task: str, variants: dict[str, dict[str, np.ndarray]]) -> Iterator[Comparison]:
-    """Of full runs: the published k is that of one sample of the model."""
+    """Comparisons of full runs; the published k is that of one sample of the model."""
     name, k = TASKS[task], PUBLISHED[task]
     alike = [r for v, r in variants.items() if v == "as_published" or _kind(v) == "sample"]
     counts = np.array([solves(r, "max KL < 1e-6") for r in alike], float)
@@ -163,15 +163,15 @@ def _kind(variant: str) -> str:
     return re.match(r"[a-z_]+", variant)[0]  # type: ignore[index]
 
 
-def _reading(fits: list[tuple[int, str, list[int]]], found: dict[str, Any]) -> list[str]:
+def _reading(fits: list[tuple[int, str, list[int]]], by_task: dict[str, Any]) -> list[str]:
     apart, name, counts = fits[0]
     by_accuracy = [
         f"{variant.removeprefix('tolerance')}: {solves(result, 'max KL < 1e-6')}"
-        for variant, result in found["acrobot"].items() if _kind(variant) == "tolerance"
+        for variant, result in by_task["acrobot"].items() if _kind(variant) == "tolerance"
     ]  # fmt: skip
-    exact = solves(found["acrobot"]["as_published"], "max KL < 1e-6")
+    exact = solves(by_task["acrobot"]["as_published"], "max KL < 1e-6")
     short = [
-        f"{TASKS[task]} {variant}" for task, variants in found.items() for variant, result in variants.items()
+        f"{TASKS[task]} {variant}" for task, variants in by_task.items() for variant, result in variants.items()
         if _kind(variant) not in ("tolerance", "power") and result["power_steps"].max() >= POWER_STEPS
     ]  # fmt: skip
     reading = [
@@ -187,8 +187,8 @@ def _reading(fits: list[tuple[int, str, list[int]]], found: dict[str, Any]) -> l
     ]
     if by_accuracy:
         loose = [
-            f"{variant.removeprefix('tolerance')}: {[solves(found[task][variant], 'max KL < 1e-5') for task in TASKS]}"
-            for variant in ("tolerance3e-2", "tolerance4e-2")
+            f"{tolerance}: {[solves(by_task[task][f'tolerance{tolerance}'], 'max KL < 1e-5') for task in TASKS]}"
+            for tolerance in ("3e-2", "4e-2")
         ]
         reading += [
             "What the count depends on most is how far the power iteration goes: Acrobot takes "
@@ -204,13 +204,13 @@ def _reading(fits: list[tuple[int, str, list[int]]], found: dict[str, Any]) -> l
     return reading
 
 
-def _figure(found: dict[str, dict[str, Any]], scale: str) -> Figure:
+def _figure(by_task: dict[str, dict[str, Any]], scale: str) -> Figure:
     figure = Figure(figsize=(9.6, 7.4))
     figure.text(0.06, 0.965, "Table S2: biasing iterations of the control tasks", fontsize=12, weight="bold")
     about = f"largest KL of the optimal dynamics to the model after each eigen-solve; {samples(scale)} samples of each"
     about += " (s,a). The script stops below the dotted line"
     figure.text(0.06, 0.938, about, fontsize=8, color="#555555")
-    for i, (task, variants) in enumerate(found.items()):
+    for i, (task, variants) in enumerate(by_task.items()):
         axes = figure.add_axes((0.075 + 0.49 * (i % 2), 0.565 - 0.475 * (i // 2), 0.41, 0.32))
         drawn = set()
         for variant, result in variants.items():
@@ -234,11 +234,9 @@ def _figure(found: dict[str, dict[str, Any]], scale: str) -> Figure:
         axes.set_ylabel("max KL, nats", fontsize=8.5)
         axes.tick_params(labelsize=8)
         ours = solves(variants["as_published"], "max KL < 1e-6")
-        its = control_task(task)
-        title = (
-            f"{TASKS[task]} {its.bins[0]}^{len(its.bins)}, beta {its.beta:g}: k = {ours}, published {PUBLISHED[task]}"
-        )
-        axes.set_title(title, fontsize=9.5)
+        control = control_task(task)
+        about = f"{TASKS[task]} {control.bins[0]}^{len(control.bins)}, beta {control.beta:g}"
+        axes.set_title(f"{about}: k = {ours}, published {PUBLISHED[task]}", fontsize=9.5)
         if i == 0:
             axes.legend(fontsize=7, loc="upper right")
     return figure
