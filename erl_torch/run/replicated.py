@@ -32,18 +32,18 @@ from erl_torch.empirical import reservations
 from erl_torch.empirical.reservations import Counted, Reservation
 from erl_torch.empirical.uncertainty import Estimate
 from erl_torch.evaluation import Judge, evaluate
-from erl_torch.experience.collect import COLUMN_BYTES, collect
-from erl_torch.experience.recording import check_target, save_columns
-from erl_torch.experience.simulation import KEEP_BYTES, TUPLE_BYTES, ReplicaExperience, Simulation
+from erl_torch.experience.collect import COLUMN_BYTES
+from erl_torch.experience.simulation import KEEP_BYTES, ReplicaExperience, Simulation
 from erl_torch.experience.transitions import Transitions
-from erl_torch.files import read_npy, write_json, write_png
+from erl_torch.files import write_json, write_png
 from erl_torch.learners import Exact, NonFiniteError
 from erl_torch.learners.learner import columns
 from erl_torch.learners.replicas import Replicas, ReplicaSolution
 from erl_torch.log.tensorboard import Board, hyperparameters, replica_layout
-from erl_torch.mdp.from_gymnasium import known_mdp, sizes
+from erl_torch.mdp.from_gymnasium import sizes
 from erl_torch.mdp.tabular import TabularMDP, check_policy
 from erl_torch.notes import collected, note
+from erl_torch.problem import Problem
 from erl_torch.rng import streams
 from erl_torch.run.build import (
     SafePoint,
@@ -52,8 +52,9 @@ from erl_torch.run.build import (
     episode_model,
     make_env,
     make_learner,
+    make_replica_experience,
+    make_source,
     make_world,
-    recorded,
 )
 from erl_torch.run.checkpoint import Checkpoints, Ended, rows_of
 from erl_torch.run.judge import SMALL, of_data
@@ -116,7 +117,8 @@ def train_replicas(cfg: DictConfig, directory: Path, safe_point: SafePoint, save
         replicas = Replicas(tuple(learners), threads)
         seeds = [cfg.seed + i for _ in groups for i in range(cfg.n_replicas)]
         prior = replicas.prior_policy(n_states, n_actions)
-        experience = _experience(cfg, env, world, seeds, n_states, n_actions, prior, safe_point)
+        problem = Problem(env, world.source, prior, world.mdp, world.episode)
+        experience = make_replica_experience(cfg, make_source(cfg.experience), problem, seeds, safe_point)
         n_experience = max(_lengths(experience))
         judge = _Judges(cfg, env, world, prior, [one.beta for one in learners], seeds, threads)
 
@@ -275,8 +277,8 @@ def _groups(cfg: DictConfig) -> list[Group]:
     columns = {}
     for key, values in _plain(cfg.vary).items():
         column = values if isinstance(values, list) else [values]
-        if key not in cfg.learner or key in ("name", "prior_policy"):
-            able = ", ".join(k for k in map(str, cfg.learner) if k not in ("name", "prior_policy"))
+        if key not in cfg.learner or key in ("class", "name", "prior_policy"):
+            able = ", ".join(k for k in map(str, cfg.learner) if k not in ("class", "name", "prior_policy"))
             raise InputError(f"vary.{key}", values, f"left out: the settings of the learner are {able}")
         if not column or not all(checks.is_number(value) for value in column):
             raise InputError(f"vary.{key}", values, "a list of numbers")
@@ -301,51 +303,6 @@ def _with(learner: Any, settings: Mapping[str, float]) -> Any:
         return replace(learner, **settings)
     except InputError as error:
         raise error.within("vary") from error
-
-
-def _experience(
-    cfg: DictConfig,
-    env: gym.Env[Any, Any],
-    world: World,
-    seeds: list[int],
-    n_states: int,
-    n_actions: int,
-    prior: np.ndarray,
-    safe_point: SafePoint,
-) -> ReplicaExperience:
-    shared = cfg.shared_stream or cfg.experience.name == "recorded"
-    if shared and cfg.n_replicas > 1:
-        said = "1: on one stream, replicas with the same settings would be the same (let settings vary, vary.KEY=[...])"
-        raise InputError("n_replicas", cfg.n_replicas, said)
-    if cfg.experience.name == "recorded":
-        found = recorded(cfg.experience, env, n_states, n_actions, cfg.seed, prior, safe_point)
-        if len(found) * 24 > KEEP_BYTES:
-            allowed = f"of at most {KEEP_BYTES // 24:,} tuples, as replicas hold them in memory: it has {len(found):,}"
-            raise InputError("experience.path", found.path, allowed)
-        return found.load()
-    e = cfg.experience
-    if e.save_to is not None and not shared:
-        raise InputError("experience.save_to", e.save_to, "null: there is a stream a replica (or shared_stream=true)")
-    behaviour = None if e.behaviour_policy is None else read_npy(e.behaviour_policy, "experience.behaviour_policy")
-    if shared:
-        if e.save_to is not None:
-            check_target("experience.save_to", e.save_to)
-        data = collect(world.source, e.n_episodes, e.episode_length, cfg.seed, behaviour, prior)
-        if e.save_to is not None:
-            check_target("experience.save_to", e.save_to)
-            save_columns(data, e.save_to) if e.save_to.endswith("/") else data.save(e.save_to)
-        return data
-    mdp = known_mdp(world.source)
-    if mdp is not None:
-        if cfg.keep_tuples:
-            held = TUPLE_BYTES * len(seeds) * e.n_episodes * e.episode_length
-            checks.memory("keep_tuples", "true", held, f"the tuples of {len(seeds):,} replicas")
-        return Simulation(mdp, e.n_episodes, e.episode_length, seeds, behaviour, cfg.keep_tuples)
-    made: dict[int, Transitions] = {}
-    for seed in tqdm(sorted(set(seeds)), desc="collecting", unit=" streams", delay=1, leave=False, disable=None):
-        made[seed] = collect(world.source, e.n_episodes, e.episode_length, seed, behaviour, prior)
-        safe_point()
-    return [made[seed] for seed in seeds]
 
 
 def _recorded(experience: Transitions | Sequence[Transitions]) -> Sequence[Transitions]:

@@ -26,7 +26,6 @@ from erl_torch.empirical import reservations
 from erl_torch.empirical.reservations import Reservation
 from erl_torch.empirical.uncertainty import Estimate
 from erl_torch.evaluation import Evaluation, evaluate
-from erl_torch.experience.experience import Experience
 from erl_torch.files import write_json
 from erl_torch.learners import Exact, ExactState, NonFiniteError, S1State
 from erl_torch.learners.learner import columns
@@ -35,17 +34,18 @@ from erl_torch.log.tensorboard import Board, hyperparameters, layout
 from erl_torch.mdp.from_gymnasium import sizes
 from erl_torch.mdp.tabular import TabularMDP, check_policy
 from erl_torch.notes import collected, note
+from erl_torch.problem import Problem
 from erl_torch.rng import Streams, streams
 from erl_torch.run.build import (
     SafePoint,
     World,
     check_evaluation,
-    collected_experience,
     episode_model,
     make_env,
+    make_experience,
     make_learner,
+    make_source,
     make_world,
-    recorded,
 )
 from erl_torch.run.checkpoint import Checkpoints, Ended, rows_of
 from erl_torch.run.judge import of_data
@@ -265,13 +265,8 @@ class _Learning:
     ) -> None:
         self.learner = learner
         self.sizes = sizes(world.source)
-        self.n_skipped = 0
-        self.data: Experience
-        if cfg.experience.name == "recorded":
-            found = recorded(cfg.experience, env, *self.sizes, cfg.seed, prior, safe_point)
-            self.data, self.n_skipped = found.held(), found.n_skipped
-        else:
-            self.data = collected_experience(cfg.experience, world.source, *self.sizes, rng, prior, safe_point)
+        problem = Problem(env, world.source, prior, world.mdp, world.episode)
+        self.data, self.n_skipped = make_experience(make_source(cfg.experience), problem, cfg.seed, safe_point)
         self.n_experience = len(self.data)
         self.digest: int | None = self.data.checksum()
         safe_point()
