@@ -75,7 +75,7 @@ def test_keys_are_the_arguments_of_the_class(path):
         kind = classes.resolve(text["class"], "class")
         if path.parent.name == "learner":
             assert kind is LEARNERS[path.stem]
-    elif text.id in ENTRY_POINTS:
+    elif not OmegaConf.is_missing(text, "id") and text.id in ENTRY_POINTS:
         kind = load_env_creator(gym.spec(text.id).entry_point)
     else:  # any environment of Gymnasium's: its arguments are in kwargs
         assert keys <= {"kwargs", *classes.OF_EVERY_ENV}
