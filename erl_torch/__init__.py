@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from erl_torch.experience.recording import FileRecording, open_recording, save_columns
     from erl_torch.experience.rollouts import collect_rollouts, rollout
     from erl_torch.experience.simulation import Simulation
+    from erl_torch.experience.sources import Source
     from erl_torch.experience.transitions import Transitions
     from erl_torch.learners.certainty_equivalence import CertaintyEquivalence
     from erl_torch.learners.efficient_s1.algorithm import EfficientS1
@@ -56,6 +57,7 @@ _HOME = {
     "S1State": "learners.s1.algorithm",
     "Simulation": "experience.simulation",
     "Solution": "solution",
+    "Source": "experience.sources",
     "bootstrap_theta": "empirical.uncertainty",
     "certify": "solvers",
     "iterate_biasing": "solvers",
@@ -101,6 +103,7 @@ __all__ = [
     "S1State",
     "Simulation",
     "Solution",
+    "Source",
     "Status",
     "TabularMDP",
     "Transitions",

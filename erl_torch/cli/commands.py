@@ -6,6 +6,7 @@ work is imported when it begins: torch takes seconds, and --help and Tab complet
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable
 from importlib.resources import files
@@ -25,6 +26,7 @@ python train.py env=windy_cliff                        the paper's Figure 5
 python train.py learner.beta=5 experience.n_episodes=200
 python train.py env=FrozenLake-v1                      any environment of Gymnasium's with finite spaces
 python train.py learner=s1_efficient                   the learner to use
+python train.py learner.class=my_package.MyLearner     one of your own; env.class and experience.class likewise
 python train.py -m learner.beta=2,5,10 seed=0,1        one run a combination
 tensorboard --logdir runs                              look at the runs
 """
@@ -138,6 +140,7 @@ def main() -> None:
             print(f"error: {given or 'no command'}: must be one of {', '.join(COMMANDS)}", file=sys.stderr)
         print("\n".join(lines), file=sys.stdout if asked else sys.stderr)
         raise SystemExit(0 if asked else 2)
+    sys.path.append(os.getcwd())  # for classes of one's own; Python does it for scripts
     command, _ = COMMANDS[sys.argv.pop(1)]
     command()
 

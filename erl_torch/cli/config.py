@@ -47,13 +47,16 @@ def config_dir(arguments: Sequence[str]) -> Path | None:
     return None if folder is None else Path(folder)
 
 
+def overrides(arguments: Sequence[str]) -> list[str]:
+    """The arguments of a command without Hydra's options."""
+    return list(get_args_parser().parse_known_args(list(arguments))[0].overrides)
+
+
 def composed(conf: Path, config_name: str, arguments: Sequence[str]) -> DictConfig:
-    """What the arguments of a command make of ``config_name``, without Hydra's own settings and options."""
-    overrides = [
-        a for a in get_args_parser().parse_known_args(list(arguments))[0].overrides if not a.startswith("hydra")
-    ]
+    """What the arguments of a command make of ``config_name``; those for Hydra itself are left out."""
+    of_ours = [a for a in overrides(arguments) if not a.startswith("hydra")]
     folder = config_dir(arguments)
     if folder is not None:
-        overrides.append("hydra.searchpath=['file://{}']".format(str(folder.resolve()).replace("'", "\\'")))
+        of_ours.append("hydra.searchpath=['file://{}']".format(str(folder.resolve()).replace("'", "\\'")))
     with initialize_config_dir(str(conf.resolve()), version_base="1.3"):
-        return compose(config_name, overrides)
+        return compose(config_name, of_ours)

@@ -26,7 +26,7 @@ from omegaconf.errors import OmegaConfBaseException, ValidationError
 
 from erl_torch.checks import InputError, out_of_memory
 from erl_torch.cli import named_classes, sweeps
-from erl_torch.cli.config import composed, register
+from erl_torch.cli.config import composed, overrides, register
 from erl_torch.files import alone, began_with, write_bytes
 from erl_torch.output import lasting
 from erl_torch.run.settings import allowed
@@ -35,6 +35,7 @@ from erl_torch.run.settings import allowed
 register()
 
 GROUPS = ("env", "learner", "experience", "evaluation")
+WITH_CLASSES = ("train", "compare")  # the commands that make what a class is named for
 BY_RUN = (InputError, ArithmeticError, OSError, MemoryError, BrokenExecutor)
 BY_CONFIGURATION = (HydraException, OmegaConfBaseException)
 OPEN_NODES = (
@@ -193,11 +194,13 @@ def run(main: Callable[[], Any], about: str, conf: Path, config_name: str) -> No
     resumed = [Path(a.removeprefix("resume=")) for a in typed if a.startswith("resume=")]
     others = [a for a in typed if not a.startswith("resume=")]
     try:
-        arguments = named_classes.choices(_resumed(typed), conf)
-        for directory in resumed:
-            named_classes.named_again(directory, arguments, others)
-        arguments = named_classes.offer(arguments)
-        _offer_completions(typed, conf)
+        arguments = _resumed(typed)
+        if config_name in WITH_CLASSES:
+            arguments = named_classes.choices(arguments, conf)
+            for directory in resumed:
+                named_classes.named_again(directory, arguments, others)
+            arguments = named_classes.offer(arguments)
+            _offer_completions(typed, conf)
     except InputError as error:
         raise SystemExit(report(error)) from None
     # Keys that no schema lists need Hydra's "++"; the user need not know.
@@ -256,8 +259,10 @@ def _resumed(arguments: list[str]) -> list[str]:
     for argument in began:  # as Hydra notes them: none of its own settings and options
         if not re.fullmatch(r"(\+\+|\+|~)?(?!hydra\b)\w[\w@/.:-]*(=.*)?", argument, re.DOTALL):
             raise InputError("resume", directory, f"that of a run: {argument!r} in its overrides.yaml is no key=value")
-    others = [a for a in arguments if a not in given]
-    return [*began, *others, "hydra.run.dir='{}'".format(str(directory).replace("'", "\\'"))]
+    others = [a for a in overrides(arguments) if a not in given]
+    options = [a for a in arguments if a not in (*given, *others)]  # at the end: Hydra wants all overrides together
+    return [*began, *others, "hydra.run.dir='{}'".format(str(directory).replace("'", "\\'")), *options]
+
 
 
 def _by_id(argument: str, conf: Path) -> list[str]:
@@ -271,8 +276,8 @@ def _by_id(argument: str, conf: Path) -> list[str]:
     return ["env=gym", f"env.id={match[1]}"]
 
 
-def _help(about: str, conf: Path, config_name: str, overrides: list[str]) -> str:
-    cfg = composed(conf, config_name, overrides)
+def _help(about: str, conf: Path, config_name: str, arguments: list[str]) -> str:
+    cfg = composed(conf, config_name, arguments)
     choices = [
         f"  {group.name}={{{','.join(sorted(option.stem for option in group.glob('*.yaml')))}}}"
         for group in sorted(conf.iterdir())
@@ -326,7 +331,7 @@ def _explain(error: Exception) -> str:
     subject = override[1] if override else getattr(reason, "full_key", None)
     node = getattr(reason, "parent_node", None)
     if re.search(r"Key '[^']*' (is )?not in", said) and node is not None:
-        names = [name for name in map(str, node) if name not in ("class", "name")]
+        names = [name for name in map(str, node) if name != "name"]
         given = next((a for a in sys.argv[1:] if a.lstrip("+~").startswith(f"{subject}=")), subject)
         return f"{given}: no such key; there are {', '.join(names)}"
     given = next((a for a in sys.argv[1:] if a.startswith(str(subject))), str(subject))  # whole, if it has spaces

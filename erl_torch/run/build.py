@@ -195,7 +195,7 @@ def make_source(cfg: DictConfig, key: str = "experience") -> Source:
     """The source of experience of ``cfg``. Raises InputError, under ``key``."""
     kind = resolve(cfg.get("class"), f"{key}.class")
     if not issubclass(kind, Source):
-        raise InputError(f"{key}.class", cfg["class"], "a class derived from erl_torch.experience.sources.Source")
+        raise InputError(f"{key}.class", cfg["class"], "a class derived from erl_torch.Source")
     source: Source = _made(cfg, kind, key)
     return source
 

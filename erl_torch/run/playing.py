@@ -20,6 +20,7 @@ from erl_torch.mdp.from_gymnasium import sizes
 from erl_torch.mdp.tabular import check_policy
 from erl_torch.rng import streams
 from erl_torch.run.build import make_env
+from erl_torch.run.classes import is_own
 from erl_torch.run.settings import Play, check_keys
 from erl_torch.solution import Solution
 
@@ -53,7 +54,14 @@ def play(cfg: DictConfig) -> Played:
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # pygame draws without a display
     run = find_run(cfg.run)
     settings = run_settings(run)
-    module, colon, _ = str(settings.env.id).partition(":")
+    kind = settings.env.get("class")
+    named = cfg.env["class"]
+    if named is not None and named != kind:
+        raise InputError("env.class", named, f"left out: the environment of {run} is of another class")
+    if kind is not None and not is_own(kind) and named is None:
+        allowed = f"typed as env.class={kind}: it makes the run's environment, and is imported only if you name it"
+        raise InputError("env.class", named, allowed)
+    module, colon, _ = str(settings.env.get("id")).partition(":")
     if cfg.module != (module if colon else None):
         if colon:
             allowed = f"typed as module={module}: it makes the run's environment, and runs only if you name it"
@@ -144,7 +152,8 @@ def run_settings(run: Path) -> DictConfig:
         cfg: Any = OmegaConf.load(path)
         OmegaConf.resolve(cfg)
         check_keys(cfg)
-        for group, names in (("env", ("name", "id")), ("learner", ("name",)), ("evaluation", ("horizon",))):
+        place = "class" if "class" in cfg.env else "id"
+        for group, names in (("env", ("name", place)), ("learner", ("name",)), ("evaluation", ("horizon",))):
             for name in names:
                 _ = cfg[group][name]
         if "n_samples" in cfg.env:
