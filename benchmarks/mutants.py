@@ -1784,7 +1784,7 @@ MUTANTS = [
     ),
     Mutant(
         "replicas of a seed are held against the first one's beta",
-        "run/replicated.py",
+        "run/replicas.py",
         "held[r] = data_of(here, learners[r])",
         "held[r] = data_of(here, learners[0])",
         "test_reservations.py::test_each_replica_of_a_seed_is_held_against_the_data_at_its_own_beta",

@@ -271,12 +271,9 @@ def test_any_error_keeps_what_was_learnt(tmp_path, monkeypatch, error, place, re
     """... as it was after the last whole epoch, wherever in the next one it came."""
     cfg = composed(*SMALL, *SHORT["s1"], *replicas)
     train(cfg, tmp_path / "whole")
-    module = "replicated" if replicas else "training"
     target, name = {
         "learner": (AlgorithmS1, "step") if not replicas else (Replicas, "iterate"),
-        "evaluation": (f"erl_torch.run.{module}._Judges", "__call__")
-        if replicas
-        else ("erl_torch.run.training", "evaluate"),
+        "evaluation": ("erl_torch.run.replicas.Judges", "__call__") if replicas else ("erl_torch.run.single", "evaluate"),
         "log": ("erl_torch.log.tensorboard.Board", "scalars"),
     }[place]
     if isinstance(target, str):

@@ -32,7 +32,7 @@ from erl_torch.empirical.uncertainty import Estimate, theta_uncertainty
 from erl_torch.envs.windy_cliff import WindyCliffEnv
 from erl_torch.learners import LEARNERS, EfficientS1
 from erl_torch.notes import collected, note
-from erl_torch.run.replicated import _reservations
+from erl_torch.run.replicas import reservations_of
 from erl_torch.run.training import train
 from erl_torch.solution import Status
 from erl_torch.solvers import solve_soft_bellman
@@ -52,7 +52,7 @@ def changed(data, **columns):
 @pytest.fixture(autouse=True)
 def no_pictures(monkeypatch):
     """Replicas always draw: seconds, and tests of their own."""
-    monkeypatch.setattr("erl_torch.run.replicated.pictures.bands", lambda *_, **__: np.zeros((4, 4, 3), np.uint8))
+    monkeypatch.setattr("erl_torch.run.replicas.pictures.bands", lambda *_, **__: np.zeros((4, 4, 3), np.uint8))
 
 
 @pytest.fixture(scope="module")
@@ -541,7 +541,7 @@ def test_each_replica_of_a_seed_is_held_against_the_data_at_its_own_beta():
     rng = np.random.default_rng(0)
     mdp, prior = random_mdp(rng, 3, 2), np.full((3, 2), 0.5)
     experience, betas = erl_torch.Simulation(mdp, 5, 200, [7, 7, 8]), (0.5, 5.0, 5.0)
-    _, held = _reservations(experience, [EfficientS1(beta) for beta in betas], prior, None, True, lambda: None)
+    _, held = reservations_of(experience, [EfficientS1(beta) for beta in betas], prior, None, True, lambda: None)
     for r, beta in enumerate(betas):
         p, reward, _ = oracle.counted(experience.stream(r, prior), 3, 2)
         best, _ = oracle.soft_optimum(p, reward, prior, beta)
