@@ -12,7 +12,7 @@ from helpers import composed, events, random_mdp
 from erl_torch import AlgorithmS1, InputError, NonFiniteError, Replicas, Simulation, Solution, Status, collect
 from erl_torch.learners import LEARNERS
 from erl_torch.log.event_file import EventFile
-from erl_torch.run.checkpoint import Checkpoints, decode, encode
+from erl_torch.run.checkpoint import COMMON, Checkpoints, decode, encode
 from erl_torch.run.training import train
 
 SMALL = (
@@ -411,7 +411,7 @@ def test_values_come_back_as_they_were():
     error = NonFiniteError(3, "why")
     solution = learner.fit(collect(mdp, 1, 100, 0), 3, 2)
     there = {"a": [1, 2.5, None, True, "x"], "b": (state, error, solution), 3: np.arange(3.0), "c": 2**100}
-    back = decode(encode(there))
+    back = decode(encode(there), (*COMMON, *Replicas.of(learner, 2).states))
     assert back["a"] == there["a"]
     assert back["c"] == 2**100
     assert np.array_equal(back[3], there[3])
@@ -422,7 +422,7 @@ def test_values_come_back_as_they_were():
     assert isinstance(answer, Solution)
     assert answer.status is Status.COMPLETED
     with pytest.raises(ValueError, match="unknown class Path"):
-        decode({"class": "Path"})
+        decode({"class": "Path"}, COMMON)
 
 
 def test_checksum_sees_every_column():

@@ -70,7 +70,7 @@ class Checkpoints:
         if before is not None:
             self._compare(before)
 
-    def start(self, classes: Iterable[type]) -> Content | None:
+    def start(self, classes: Iterable[type] = ()) -> Content | None:
         """Take possession of the directory (leftovers of a killed run go), and ``read``; None: the run begins.
 
         Raises InputError as ``read``; the directory is then as it was.
@@ -85,7 +85,7 @@ class Checkpoints:
         self._others = set(self.directory.glob(PATTERN))
         return found
 
-    def read(self, classes: Iterable[type]) -> Content | None:
+    def read(self, classes: Iterable[type] = ()) -> Content | None:
         """The newest checkpoint that can be read; damaged ones go, with a warning.
 
         Args:
