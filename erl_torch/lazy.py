@@ -28,11 +28,11 @@ def loader(
         old = (renamed or {}).get(name)
         if old is not None:
             warnings.warn(f"{package}.{name} is deprecated: use {old.instead}", DeprecationWarning, stacklevel=2)
-            value: object = getattr(importlib.import_module(f"{package}.{old.module}"), old.name)
-            return value
+            renamed_to: object = getattr(importlib.import_module(f"{package}.{old.module}"), old.name)
+            return renamed_to
         if name not in home:
             raise AttributeError(f"module '{package}' has no attribute '{name}'")
-        value = getattr(importlib.import_module(f"{package}.{home[name]}"), name)
+        value: object = getattr(importlib.import_module(f"{package}.{home[name]}"), name)
         return value
 
     return load

@@ -1,5 +1,6 @@
 """The configuration: complete, typed, explained, and clear about what it refuses."""
 
+import inspect
 import math
 import re
 import resource
@@ -7,8 +8,10 @@ from dataclasses import fields
 from itertools import pairwise
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.envs.registration import load_env_creator
 from helpers import CONF, composed
 from omegaconf import OmegaConf
 
@@ -16,9 +19,11 @@ from erl_torch import InputError, checks
 from erl_torch.checks import InputError as ChecksInputError
 from erl_torch.cli import config
 from erl_torch.cli import main as cli
+from erl_torch.envs import ENTRY_POINTS
 from erl_torch.learners import LEARNERS, AlgorithmS1, ListedS1
+from erl_torch.run import classes
 from erl_torch.run import settings as schemas
-from erl_torch.run.build import make_learner
+from erl_torch.run.build import OF_THE_MODEL, make_learner
 from erl_torch.run.training import train
 
 
@@ -46,14 +51,6 @@ def test_defaults_are_figure_5s(authors):
     assert cfg.env.wind_angle == pytest.approx(authors["wind"][0, 1, 1], abs=1e-15)
 
 
-@pytest.mark.parametrize("name", sorted(LEARNERS))
-def test_schema_is_the_learners_signature(name):
-    schema = {f.name: f.default for f in fields(schemas.SCHEMAS["learner"][name])}
-    learner = {f.name: f.default for f in fields(LEARNERS[name])}
-    assert schema.pop("name") == name
-    assert schema == learner
-
-
 @pytest.mark.parametrize("path", sorted(CONF.rglob("*.yaml")), ids=lambda p: f"{p.parent.name}/{p.stem}")
 def test_every_key_is_explained(path):
     """A comment on the key's own line or on the one above."""
@@ -66,19 +63,29 @@ def test_every_key_is_explained(path):
             assert "#" in line or above.lstrip().startswith("#"), line
 
 
-def presets(group):
-    """Files that only set keys of another one of their group."""
-    paths = (CONF / group).glob("*.yaml")
-    return {path.stem for path in paths if OmegaConf.load(path).defaults[0] in schemas.SCHEMAS[group]}
+OF_A_CLASS = [path for group in classes.GROUPS for path in sorted((CONF / group).glob("*.yaml"))]
 
 
-@pytest.mark.parametrize("group", sorted(schemas.SCHEMAS))
-def test_every_schema_has_its_yaml(group):
-    stems = {p.stem for p in (CONF / group).glob("*.yaml")}
-    assert stems - presets(group) == set(schemas.SCHEMAS[group])
-    for stem in stems - presets(group):
-        keys = set(OmegaConf.load(CONF / group / f"{stem}.yaml")) - {"defaults"}
-        assert keys == {f.name for f in fields(schemas.SCHEMAS[group][stem])}
+@pytest.mark.parametrize("path", OF_A_CLASS, ids=lambda path: f"{path.parent.name}/{path.stem}")
+def test_keys_are_the_arguments_of_the_class(path):
+    """All of them, and besides those that tell where it is and what suits it."""
+    text = OmegaConf.load(path)
+    keys = set(text) - {"defaults", "class", "name", "id", "suggest", *OF_THE_MODEL}
+    if "class" in text:
+        kind = classes.resolve(text["class"], "class")
+        if path.parent.name == "learner":
+            assert kind is LEARNERS[path.stem]
+    elif not OmegaConf.is_missing(text, "id") and text.id in ENTRY_POINTS:
+        kind = load_env_creator(gym.spec(text.id).entry_point)
+    else:  # any environment of Gymnasium's: its arguments are in kwargs
+        assert keys <= {"kwargs", *classes.OF_EVERY_ENV}
+        return
+    assert keys == set(inspect.signature(kind).parameters) - {"render_mode"}
+
+
+@pytest.mark.parametrize("path", sorted((CONF / "env").glob("*.yaml")), ids=lambda path: path.stem)
+def test_suggestions_are_settings_that_exist(path):
+    assert set(OmegaConf.load(path).suggest) <= {f.name for f in fields(schemas.Suggest)}
 
 
 @pytest.mark.parametrize("path", sorted((CONF / "env").glob("*.yaml")), ids=lambda path: path.stem)
@@ -217,7 +224,7 @@ def test_want_of_memory_is_one_line(message, expected):
         assert re.fullmatch(r"memory: not enough \(.*\)", cli._line(message))
 
 
-@pytest.mark.parametrize("group", ["", *(f"{g}." for g in schemas.SCHEMAS)])
+@pytest.mark.parametrize("group", ["", "env.", "learner.", "experience.", "evaluation."])
 @pytest.mark.parametrize("plus", ["", "+"])
 def test_unknown_keys_get_one_line(tmp_path, group, plus):
     line = complaint(tmp_path, f"{plus}{group}abcxyz=2")
@@ -240,8 +247,8 @@ def test_unknown_keys_get_one_line(tmp_path, group, plus):
         (["learner.beta=1000"], "learner.beta=1000.0: must be below 745"),
         (["n_replicas=2.5"], "n_replicas=2.5: must be a whole number >= 1, in digits"),
         (["seed=abc"], "seed=abc: must be a whole number >= 0, in digits"),
-        (["experience.n_episodes=1e15"], "experience.n_episodes=1e15: must be a whole number >= 1, in digits"),
-        (["++learner.n_epochs=1.5"], "learner.n_epochs=1.5: must be a whole number >= 1, in digits"),
+        (["experience.n_episodes=1e15"], "experience.n_episodes=1000000000000000.0: must be a whole number, in digits"),
+        (["++learner.n_epochs=1.5"], "learner.n_epochs=1.5: must be a whole number, in digits"),
         (["learner.lr_rho=x"], "learner.lr_rho=x: must be a number, or null"),
         (["learner.clip_rho=maybe"], "learner.clip_rho=maybe: must be true or false"),
         (["env.suggest.beta=x"], "env.suggest.beta=x: must be a number"),

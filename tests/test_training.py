@@ -319,8 +319,6 @@ def test_errors_are_one_line(typed_here, tmp_path, argument, code, start):
     assert err.count("\n") == 1
     assert out == ""
     assert not list(tmp_path.rglob("runs/*"))
-    if "two" in argument:
-        assert list(tmp_path.iterdir()) == []
 
 
 def test_a_refused_command_leaves_the_run_s_own(typed_here, tmp_path):
@@ -330,7 +328,7 @@ def test_a_refused_command_leaves_the_run_s_own(typed_here, tmp_path):
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     code, _, err = typed_here("train.py", *arguments, "learner.beta=7")
     assert code == 1
-    assert "not learner.beta=7.0 (there: 10.0)" in err
+    assert "not learner.beta=7 (there: 10.0)" in err
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
     code, _, err = typed_here("train.py", "resume=run", "threads=2")  # no result depends on it
     assert code == 0

@@ -1,14 +1,20 @@
-"""What Hydra is told: the schemas of ``conf/``, and the resolvers that name run directories."""
+"""What Hydra is told: schemas, the resolvers that name run directories, and how a configuration is composed."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
+from hydra import compose, initialize_config_dir
+from hydra._internal.utils import get_args_parser
 from hydra.core.config_store import ConfigStore
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
-from erl_torch.run.settings import SCHEMAS, Compare, Play, Reproduce, Train
+from erl_torch.run.settings import Compare, Play, Reproduce, Standard, Suggest, Train
+
+COMMANDS = {"train": Train, "compare": Compare, "reproduce": Reproduce, "play": Play}
 
 
 def slug(text: Any) -> str:
@@ -27,12 +33,27 @@ def run_name(number: int, overrides: str) -> str:
 def register() -> None:
     """Make the schemas and resolvers known to Hydra; harmless when repeated."""
     store = ConfigStore.instance()
-    for group, options in SCHEMAS.items():
-        for name, schema in options.items():
-            store.store(group=f"schema/{group}", name=name, node=schema)
-    store.store(group="schema", name="train", node=Train)
-    store.store(group="schema", name="compare", node=Compare)
-    store.store(group="schema", name="reproduce", node=Reproduce)
-    store.store(group="schema", name="play", node=Play)
+    for name, schema in COMMANDS.items():
+        store.store(group="schema", name=name, node=schema)
+    store.store(group="schema", name="suggest", node=Suggest)
+    store.store(group="schema/evaluation", name="standard", node=Standard)
     OmegaConf.register_new_resolver("slug", slug, replace=True)
     OmegaConf.register_new_resolver("run_name", run_name, replace=True)
+
+
+def config_dir(arguments: Sequence[str]) -> Path | None:
+    """The folder of ``--config-dir`` among the arguments of a command."""
+    folder = get_args_parser().parse_known_args(list(arguments))[0].config_dir
+    return None if folder is None else Path(folder)
+
+
+def composed(conf: Path, config_name: str, arguments: Sequence[str]) -> DictConfig:
+    """What the arguments of a command make of ``config_name``, without Hydra's own settings and options."""
+    overrides = [
+        a for a in get_args_parser().parse_known_args(list(arguments))[0].overrides if not a.startswith("hydra")
+    ]
+    folder = config_dir(arguments)
+    if folder is not None:
+        overrides.append("hydra.searchpath=['file://{}']".format(str(folder.resolve()).replace("'", "\\'")))
+    with initialize_config_dir(str(conf.resolve()), version_base="1.3"):
+        return compose(config_name, overrides)

@@ -14,11 +14,9 @@ import threading
 import traceback
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor
-from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
-from hydra import compose, initialize_config_dir
 from hydra.core import utils as hydra_utils
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, OverrideParseException
@@ -27,15 +25,16 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException, ValidationError
 
 from erl_torch.checks import InputError, out_of_memory
-from erl_torch.cli import sweeps
-from erl_torch.cli.config import register
+from erl_torch.cli import named_classes, sweeps
+from erl_torch.cli.config import composed, register
 from erl_torch.files import alone, began_with, write_bytes
 from erl_torch.output import lasting
-from erl_torch.run.settings import SCHEMAS, allowed
+from erl_torch.run.settings import allowed
 
 # Here, for jobs in processes of their own: loading the task imports this module, and names directories next.
 register()
 
+GROUPS = ("env", "learner", "experience", "evaluation")
 BY_RUN = (InputError, ArithmeticError, OSError, MemoryError, BrokenExecutor)
 BY_CONFIGURATION = (HydraException, OmegaConfBaseException)
 OPEN_NODES = (
@@ -191,8 +190,14 @@ def run(main: Callable[[], Any], about: str, conf: Path, config_name: str) -> No
     """
     lasting()
     typed = sys.argv[1:]
+    resumed = [Path(a.removeprefix("resume=")) for a in typed if a.startswith("resume=")]
+    others = [a for a in typed if not a.startswith("resume=")]
     try:
-        arguments = _resumed(typed)
+        arguments = named_classes.choices(_resumed(typed), conf)
+        for directory in resumed:
+            named_classes.named_again(directory, arguments, others)
+        arguments = named_classes.offer(arguments)
+        _offer_completions(typed, conf)
     except InputError as error:
         raise SystemExit(report(error)) from None
     # Keys that no schema lists need Hydra's "++"; the user need not know.
@@ -205,17 +210,15 @@ def run(main: Callable[[], Any], about: str, conf: Path, config_name: str) -> No
     rows: list[dict[str, Any]] = []
     try:
         sweeps.presets()
-        for argument in typed:
-            if argument.startswith("resume="):
-                directory = Path(argument.removeprefix("resume="))
-                _same_modules(directory, arguments, [a for a in typed if a != argument], conf, config_name)
+        for directory in resumed:
+            named_classes.composed_again(directory, arguments, others, conf, config_name)
         for argument in arguments:
             group, _, value = argument.partition("=")
-            if group in SCHEMAS and re.fullmatch(r"[-+.\d].*|true|false|null", value, re.IGNORECASE):
+            if group in GROUPS and re.fullmatch(r"[-+.\d].*|true|false|null", value, re.IGNORECASE):
                 options = sorted(path.stem for path in (conf / group).glob("*.yaml"))
                 raise InputError(group, value, " or ".join(options))  # Hydra has a bare ValueError for it
         if {"-h", "--help"} & set(arguments):
-            print(_help(about, conf, config_name, [a for a in arguments if not a.startswith("-")]))
+            print(_help(about, conf, config_name, arguments))
             return
         with sweeps.patient_launchers() as directories:
             try:
@@ -234,6 +237,13 @@ def run(main: Callable[[], Any], about: str, conf: Path, config_name: str) -> No
         raise SystemExit(1)
 
 
+def _offer_completions(arguments: list[str], conf: Path) -> None:
+    """What Tab completes is in the environment: its classes are offered too."""
+    *words, last = os.environ.get("COMP_LINE", "").split(" ")
+    if {"-sc", "--shell-completion"} & set(arguments):
+        os.environ["COMP_LINE"] = " ".join([*named_classes.offer(named_classes.choices(words, conf)), last])
+
+
 def _resumed(arguments: list[str]) -> list[str]:
     """resume=RUN_DIR in full: the arguments that the run began with, and its directory."""
     given = [a for a in arguments if a.startswith("resume=")]
@@ -250,18 +260,6 @@ def _resumed(arguments: list[str]) -> list[str]:
     return [*began, *others, "hydra.run.dir='{}'".format(str(directory).replace("'", "\\'"))]
 
 
-def _same_modules(directory: Path, arguments: list[str], typed: list[str], conf: Path, config_name: str) -> None:
-    """Raise InputError if the environment of a run directory is of a module that nobody has ``typed``: making it
-    would run that module."""
-    with initialize_config_dir(str(conf.resolve()), version_base="1.3"):
-        cfg = compose(config_name, [a for a in arguments if not a.startswith(("hydra", "-"))])
-    named = str(cfg.env.get("id"))
-    module = named.partition(":")[0]
-    if ":" in named and not any(f"{module}:" in a.partition("=")[2] for a in typed if a.lstrip("+").startswith("env")):
-        allowed = f"named with its module, which is imported: add env={named}"
-        raise InputError("resume", directory, allowed)
-
-
 def _by_id(argument: str, conf: Path) -> list[str]:
     """env=ID for env=NAME: the configuration with that id, or any environment of Gymnasium's."""
     match = re.fullmatch(r"env=((?:[\w.:-]+/)?[\w.:-]+-v\d+)", argument)
@@ -274,8 +272,7 @@ def _by_id(argument: str, conf: Path) -> list[str]:
 
 
 def _help(about: str, conf: Path, config_name: str, overrides: list[str]) -> str:
-    with initialize_config_dir(str(conf.resolve()), version_base="1.3"):
-        cfg = compose(config_name, overrides)
+    cfg = composed(conf, config_name, overrides)
     choices = [
         f"  {group.name}={{{','.join(sorted(option.stem for option in group.glob('*.yaml')))}}}"
         for group in sorted(conf.iterdir())
@@ -327,9 +324,9 @@ def _explain(error: Exception) -> str:
         return str(InputError(missing[1], "???", f"given, as in {missing[1]}=VALUE"))
     override = re.search(r"(?:Error merging override|Could not override) '?([^\s']+?)'?\.?(?:\s|$)", str(error))
     subject = override[1] if override else getattr(reason, "full_key", None)
-    schema = getattr(reason, "object_type", None)
-    if re.search(r"Key '[^']*' (is )?not in", said) and is_dataclass(schema):
-        names = [field.name for field in fields(schema) if field.name != "name"]
+    node = getattr(reason, "parent_node", None)
+    if re.search(r"Key '[^']*' (is )?not in", said) and node is not None:
+        names = [name for name in map(str, node) if name not in ("class", "name")]
         given = next((a for a in sys.argv[1:] if a.lstrip("+~").startswith(f"{subject}=")), subject)
         return f"{given}: no such key; there are {', '.join(names)}"
     given = next((a for a in sys.argv[1:] if a.startswith(str(subject))), str(subject))  # whole, if it has spaces

@@ -4,33 +4,39 @@ from __future__ import annotations
 
 import contextlib
 import warnings
-from collections.abc import Callable, Iterator
-from dataclasses import fields
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import gymnasium as gym
-import numpy as np
+from gymnasium.envs.registration import EnvSpec, load_env_creator
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from erl_torch import checks
 from erl_torch.checks import InputError
+from erl_torch.envs import ENTRY_POINTS
 from erl_torch.envs.discretise import Discretise
 from erl_torch.envs.estimate import estimate_mdp
-from erl_torch.experience.collect import collect, record
+from erl_torch.experience.collect import COLUMN_BYTES
 from erl_torch.experience.experience import Experience
-from erl_torch.experience.recording import FileRecording, check_target, open_recording
+from erl_torch.experience.recording import FileRecording
+from erl_torch.experience.simulation import KEEP_BYTES, TUPLE_BYTES, ReplicaExperience
+from erl_torch.experience.sources import Source
+from erl_torch.experience.transitions import Transitions, join
 from erl_torch.files import read_npy
-from erl_torch.learners import LEARNERS
-from erl_torch.mdp.from_gymnasium import MeanRewardWarning, absorbing, known_mdp, tabular_mdp
-from erl_torch.mdp.tabular import TabularMDP
+from erl_torch.mdp.from_gymnasium import MeanRewardWarning, absorbing, known_mdp, sizes, tabular_mdp
+from erl_torch.mdp.tabular import TabularMDP, check_policy
 from erl_torch.notes import note
-from erl_torch.rng import Streams
+from erl_torch.problem import Problem
+from erl_torch.run.classes import OF_EVERY_ENV, resolve, settings_of
 
 SafePoint = Callable[[], None]
 TABLES = 8  # of a learner's size, about, while it learns and is evaluated
 REPLICA_BYTES = 10_000  # of a replica, besides: generators and settings
-NOT_ARGUMENTS = ("name", "id", "suggest", "stream", "n_samples", "model_seed")
+LABELS = ("class", "name")  # keys of every group that are no arguments
+OF_THE_MODEL = ("stream", "n_samples", "model_seed")  # of a control task
+OF_NO_ENV = (*LABELS, "id", "suggest", *OF_THE_MODEL, *OF_EVERY_ENV)
+LEARNER_METHODS = ("init", "iterate", "solution")
 
 
 class World(NamedTuple):
@@ -51,29 +57,54 @@ def group(name: str) -> Iterator[None]:
 
 
 def make_env(cfg: DictConfig, render_mode: str | None = None) -> gym.Env[Any, Any]:
-    """The environment of ``cfg``. Raises InputError."""
+    """The environment of ``cfg``: its ``class``, or what Gymnasium has under its ``id``. Raises InputError."""
     keys: Any = OmegaConf.to_container(cfg, resolve=True)
-    arguments = keys["kwargs"] if "kwargs" in keys else {k: v for k, v in keys.items() if k not in NOT_ARGUMENTS}
     with group("env"):
+        kind, spec = _env_class(keys)
+        if "kwargs" in keys:
+            arguments = keys["kwargs"]
+        elif kind is None:
+            arguments = {
+                key: value for key, value in keys.items() if key not in OF_NO_ENV or key in ("bins", "low", "high")
+            }
+        else:
+            arguments = settings_of(keys, kind, OF_NO_ENV)
         if isinstance(arguments.get("wind"), str):
             arguments["wind"] = read_npy(arguments["wind"], "wind")
         if render_mode is not None:
             arguments["render_mode"] = render_mode
         try:
-            env = gym.make(cfg.id, **arguments)
+            env = gym.make(spec, **arguments)
         except InputError:
             raise
         except (gym.error.Error, ImportError) as error:
-            raise InputError("id", cfg.id, f"an environment that Gymnasium has ({error})") from error
+            raise InputError("id", cfg.get("id"), f"an environment that Gymnasium has ({error})") from error
         except Exception as error:  # whatever an environment answers arguments with
             if checks.out_of_memory(error):
                 raise
-            said = f"{type(error).__name__}: {error}"
-            raise InputError("kwargs", arguments, f"arguments of {cfg.id} ({said})") from error
-        binning = {key: keys.get(key) for key in ("bins", "low", "high", "actions")}
-        if "kwargs" in keys and any(value is not None for value in binning.values()):
+            message = f"{type(error).__name__}: {error}"
+            name = spec if isinstance(spec, str) else keys["class"]
+            raise InputError("kwargs", arguments, f"arguments of {name} ({message})") from error
+        binning = {key: keys.get(key) for key in ("bins", "low", "high", "actions") if key not in arguments}
+        if any(value is not None for value in binning.values()):
             return Discretise(env, **binning)
         return env
+
+
+def _env_class(keys: dict[str, Any]) -> tuple[type | None, str | EnvSpec]:
+    """The class of an environment, None where only Gymnasium knows it, and what ``gymnasium.make`` takes."""
+    path, name = keys.get("class"), keys.get("id")
+    if path is None and name is None:
+        raise InputError("id", name, "given, as in env.id=FrozenLake-v1, or env.class=my_package.MyEnv")
+    if path is None:
+        known = "kwargs" not in keys and name in ENTRY_POINTS
+        creator: Any = load_env_creator(str(gym.spec(str(name)).entry_point)) if known else None
+        return creator, str(name)
+    kind = resolve(path, "class")
+    if not issubclass(kind, gym.Env):
+        raise InputError("class", path, "a class derived from gymnasium.Env")
+    creator = kind
+    return kind, EnvSpec(kind.__name__, entry_point=creator)
 
 
 def make_world(cfg: DictConfig, env: gym.Env[Any, Any], safe_point: SafePoint) -> World:
@@ -127,24 +158,51 @@ def _control_world(cfg: DictConfig, env: gym.Env[Any, Any], safe_point: SafePoin
     return World(TabularMDP(mdp.transition, mdp.reward), mdp)
 
 
-def episode_model(env: gym.Env[Any, Any], world: World) -> TabularMDP | None:
-    """The model whose rewards over the horizon are an episode's return; None where there is none."""
-    endless = known_mdp(env) is not None and not getattr(env.unwrapped, "ends", np.zeros(1)).any()
-    return world.episode or (world.mdp if endless else None)
+def make_problem(cfg: DictConfig, env: gym.Env[Any, Any], world: World, learner: Any) -> Problem:
+    """What there is to learn in ``env`` as the run ``cfg`` says, with the prior of ``learner``. Raises InputError."""
+    prior = check_policy("learner.prior_policy", learner.prior_policy, *sizes(env))
+    horizon = min(cfg.evaluation.horizon, (env.spec and env.spec.max_episode_steps) or cfg.evaluation.horizon)
+    return Problem(env, world.source, prior, world.mdp, world.episode, horizon, cfg.env.name)
+
+
+def learner_class(cfg: DictConfig, key: str = "learner") -> Any:
+    """The class of the learner of ``cfg``. Raises InputError, under ``key``."""
+    kind = resolve(cfg.get("class"), f"{key}.class")
+    absent = [name for name in LEARNER_METHODS if not hasattr(kind, name)]
+    if absent:
+        raise InputError(f"{key}.class", cfg["class"], f"that of a learner: it has no {', '.join(absent)}")
+    return kind
 
 
 def make_learner(cfg: DictConfig, n_states: int, n_actions: int, key: str = "learner") -> Any:
     """The learner of ``cfg``; complaints name their keys under ``key``."""
-    learner_class = LEARNERS[cfg.name]
-    with group(key):
-        arguments = {f.name: cfg[f.name] for f in fields(learner_class)}
-        if cfg.prior_policy is not None:
-            arguments["prior_policy"] = read_npy(cfg.prior_policy, "prior_policy")
-        learner = learner_class(**arguments)
+    learner = _made(cfg, learner_class(cfg, key), key)
     check_sizes(n_states, n_actions)
     with group(key):
         learner.init(n_states, n_actions)  # validates the prior against the sizes
         return learner
+
+
+def make_source(cfg: DictConfig, key: str = "experience") -> Source:
+    """The source of experience of ``cfg``. Raises InputError, under ``key``."""
+    kind = resolve(cfg.get("class"), f"{key}.class")
+    if not issubclass(kind, Source):
+        raise InputError(f"{key}.class", cfg["class"], "a class derived from erl_torch.experience.sources.Source")
+    source: Source = _made(cfg, kind, key)
+    return source
+
+
+def _made(cfg: DictConfig, kind: type, key: str) -> Any:
+    """The dataclass ``kind`` with the settings of ``cfg``; the prior policy is a file there."""
+    with group(key):
+        values: Any = OmegaConf.to_container(cfg, resolve=True)
+        arguments = settings_of(values, kind, LABELS)
+        if arguments.get("prior_policy") is not None:
+            arguments["prior_policy"] = read_npy(str(arguments["prior_policy"]), "prior_policy")
+        try:
+            return kind(**arguments)
+        except TypeError as error:
+            raise InputError("class", cfg["class"], f"one that takes these settings ({error})") from error
 
 
 def check_sizes(n_states: int, n_actions: int, n_replicas: int = 1) -> None:
@@ -160,28 +218,59 @@ def check_sizes(n_states: int, n_actions: int, n_replicas: int = 1) -> None:
         checks.memory("n_states * n_actions", f"{n_states} * {n_actions}", needed, what)
 
 
-def recorded(
-    cfg: DictConfig, env: Any, n_states: int, n_actions: int, seed: int, prior: np.ndarray, safe_point: SafePoint
-) -> FileRecording:
-    """The stream that ``cfg`` names. Raises InputError."""
-    with group("experience"), _collecting("reading", None, safe_point) as report:
-        data = FileRecording(
-            cfg.path,
-            n_states,
-            n_actions,
-            on_bad=cfg.on_bad,
-            chunk=cfg.chunk,
-            env=env,
-            prior_policy=prior,
-            on_prior=cfg.on_prior,
-            seed=seed,
-            report=report,
-        )
+def make_experience(source: Source, problem: Problem, seed: int, safe_point: SafePoint) -> tuple[Experience, int]:
+    """The stream of ``seed``, in memory where it is no longer than its chunk; bad tuples that were left out.
+
+    Raises InputError.
+    """
+    with group("experience"), _collecting(source.work, source.n_tuples, safe_point) as report:
+        data = source(problem, seed, report)
+    if not isinstance(data, FileRecording):
+        return data, 0
     if data.n_skipped:
         total = data.n_skipped + len(data)
-        said = f"; the first is {data.first_skipped}" if data.first_skipped else ""
-        note(f"{cfg.path}: {data.n_skipped:,} bad tuples of {total:,} left out{said}")
-    return data
+        first = f"; the first is {data.first_skipped}" if data.first_skipped else ""
+        note(f"{data.path}: {data.n_skipped:,} bad tuples of {total:,} left out{first}")
+    return data.held(), data.n_skipped
+
+
+def make_replica_experience(
+    cfg: DictConfig, source: Source, problem: Problem, seeds: Sequence[int], safe_point: SafePoint
+) -> ReplicaExperience:
+    """One stream for all replicas, or one per seed, as the run ``cfg`` says. Raises InputError."""
+    shared = cfg.shared_stream or source.one_stream
+    if shared and cfg.n_replicas > 1:
+        allowed = (
+            "1: on one stream, replicas with the same settings would be the same (let settings vary, vary.KEY=[...])"
+        )
+        raise InputError("n_replicas", cfg.n_replicas, allowed)
+    if shared:
+        return _in_memory(make_experience(source, problem, cfg.seed, safe_point)[0])
+    with group("experience"):
+        simulation = source.simulation(problem, seeds, cfg.keep_tuples)
+    if simulation is not None:
+        if cfg.keep_tuples:
+            held = TUPLE_BYTES * len(seeds) * simulation.n_tuples
+            checks.memory("keep_tuples", "true", held, f"the tuples of {len(seeds):,} replicas")
+        return simulation
+    streams: dict[int, Transitions] = {}
+    for seed in tqdm(sorted(set(seeds)), desc=source.work, unit=" streams", delay=1, leave=False, disable=None):
+        with group("experience"):
+            streams[seed] = _in_memory(source(problem, seed, lambda _: safe_point()))
+        safe_point()
+    return [streams[seed] for seed in seeds]
+
+
+def _in_memory(data: Experience) -> Transitions:
+    """All tuples, as replicas hold them. Raises InputError for more of a file than finds room."""
+    if isinstance(data, Transitions):
+        return data
+    most = KEEP_BYTES // COLUMN_BYTES
+    if len(data) > most:
+        raise InputError(
+            "experience", f"{len(data):,} tuples", f"at most {most:,} tuples, as replicas hold them in memory"
+        )
+    return join(list(data.chunks()))
 
 
 @contextlib.contextmanager
@@ -196,37 +285,3 @@ def _collecting(what: str, total: int | None, safe_point: SafePoint) -> Iterator
             safe_point()
 
         yield report
-
-
-def collected_experience(
-    cfg: DictConfig,
-    source: TabularMDP | gym.Env[Any, Any],
-    n_states: int,
-    n_actions: int,
-    rng: Streams,
-    prior: np.ndarray,
-    safe_point: Callable[[], None],
-) -> Experience:
-    with group("experience"):
-        behaviour = None
-        if cfg.behaviour_policy is not None:
-            behaviour = read_npy(cfg.behaviour_policy, "behaviour_policy")
-        if cfg.save_to is not None:
-            check_target("save_to", cfg.save_to)
-        total = cfg.n_episodes * cfg.episode_length if cfg.n_episodes >= 1 and cfg.episode_length >= 1 else 0
-        with _collecting("collecting", total, safe_point) as report:
-            arguments = cfg.n_episodes, cfg.episode_length, rng, behaviour, prior, report
-            if cfg.save_to is not None and cfg.save_to.endswith("/"):
-                return open_recording(record(source, cfg.save_to, *arguments), n_states, n_actions)
-            data = collect(source, *arguments)
-        if cfg.save_to is not None:
-            check_target("save_to", cfg.save_to)  # again: the collecting may have taken hours
-            data.save(cfg.save_to)
-        return data
-
-
-def check_evaluation(cfg: DictConfig) -> None:
-    with group("evaluation"):
-        for key in ("every", "n_episodes", "horizon", "exact_up_to"):
-            checks.at_least(key, cfg[key], 1)
-        checks.memory("n_episodes", cfg.n_episodes, 8 * cfg.n_episodes, "the returns of all episodes")

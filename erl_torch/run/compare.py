@@ -34,12 +34,12 @@ from tqdm import tqdm
 from erl_torch import checks, parallel, pictures
 from erl_torch.checks import InputError
 from erl_torch.experience.collect import collect
+from erl_torch.experience.sources import Simulate
 from erl_torch.files import read_npy, write_json, write_png
-from erl_torch.learners import LEARNERS
 from erl_torch.learners.s1 import kernels
 from erl_torch.mdp.tabular import TabularMDP, check_policy
 from erl_torch.notes import collected
-from erl_torch.run.build import make_env, make_learner, make_world
+from erl_torch.run.build import learner_class, make_env, make_learner, make_source, make_world
 from erl_torch.run.settings import check_comparison_keys
 from erl_torch.solution import Status
 from erl_torch.solvers.optimum import Optimum, measure, solve_optimum
@@ -287,16 +287,16 @@ def run_comparison(cfg: DictConfig, directory: Path, safe_point: Callable[[], No
     checks.memory("seeds", cfg.seeds, FIT_BYTES * fits, f"{fits:,} fits")
     checks.memory("n_sizes", cfg.n_sizes, FIT_BYTES * fits * cfg.n_sizes, f"{fits:,} fits of each size")
     checks.processes("processes", min(cfg.processes, fits))
-    if cfg.experience.name != "simulate":
+    source = make_source(cfg.experience)
+    if not isinstance(source, Simulate):
         raise InputError("experience", cfg.experience.name, "simulate: every seed needs a stream of its own")
-    if cfg.experience.save_to is not None:
-        raise InputError("experience.save_to", cfg.experience.save_to, "null: there is a stream a seed")
+    if source.save_to is not None:
+        raise InputError("experience.save_to", source.save_to, "null: there is one stream per seed")
     if not cfg.learners:
         raise InputError("learners", "[]", "at least one")
     for name in cfg.learners:
-        if not hasattr(LEARNERS.get(name), "fit"):
-            able = " or ".join(name for name, learner in LEARNERS.items() if hasattr(learner, "fit"))
-            raise InputError("learners", name, able)
+        if name not in cfg.learner or not hasattr(learner_class(cfg.learner[name], f"learner.{name}"), "fit"):
+            raise InputError("learners", name, " or ".join(n for n in map(str, cfg.learner) if n != name))
     torch.set_num_threads(1)
     if not kernels.compiled_before():
         print("compiling the loops, about ten seconds: on the first run only", file=sys.stderr)

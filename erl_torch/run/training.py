@@ -11,39 +11,35 @@ import contextlib
 import os
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
 from omegaconf import DictConfig, OmegaConf
-from tqdm import tqdm
 
 from erl_torch import checks
 from erl_torch.checks import InputError
-from erl_torch.experience.collect import collect
 from erl_torch.experience.experience import Experience
-from erl_torch.experience.recording import check_target, save_columns
-from erl_torch.experience.simulation import KEEP_BYTES, TUPLE_BYTES, ReplicaExperience, Simulation, streams_of
-from erl_torch.experience.transitions import Transitions
-from erl_torch.files import read_npy
+from erl_torch.experience.simulation import ReplicaExperience, Simulation, streams_of
 from erl_torch.learners.replicas import Replicas
 from erl_torch.learners.s1 import kernels
 from erl_torch.log.tensorboard import hyperparameters
-from erl_torch.mdp.from_gymnasium import known_mdp, sizes
-from erl_torch.mdp.tabular import check_policy
+from erl_torch.mdp.from_gymnasium import sizes
 from erl_torch.notes import collected
 from erl_torch.problem import Problem
 from erl_torch.rng import streams
 from erl_torch.run.build import (
     check_sizes,
-    collected_experience,
     group,
     make_env,
+    make_experience,
     make_learner,
+    make_problem,
+    make_replica_experience,
+    make_source,
     make_world,
-    recorded,
 )
 from erl_torch.run.checkpoint import Checkpoints
 from erl_torch.run.groups import Group, groups_of
@@ -90,12 +86,9 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
         if cfg[key] and not many:
             raise InputError(key, cfg[key], "left out, or used with n_replicas > 1 or vary.KEY=[...]")
     with collected() as notes, contextlib.closing(make_env(cfg.env)) as env:
-        n_states, n_actions = sizes(env)
         world = make_world(cfg.env, env, safe_point)
-        learner = make_learner(cfg.learner, n_states, n_actions)
-        prior = check_policy("learner.prior_policy", learner.prior_policy, n_states, n_actions)
-        horizon = min(settings.horizon, (env.spec and env.spec.max_episode_steps) or settings.horizon)
-        problem = Problem(env, world.source, prior, world.mdp, world.episode, horizon, cfg.env.name)
+        learner = make_learner(cfg.learner, *sizes(env))
+        problem = make_problem(cfg, env, world, learner)
         make = _replicas if many else _single
         run = make(cfg, learner, problem, settings, saved, safe_point, began)
         return run.perform(notes)
@@ -147,20 +140,14 @@ def _single(
     safe_point: SafePoint,
     began: float,
 ) -> Run[Any, Experience, Any]:
-    rng = streams(cfg.seed)
+    learner.start(problem)  # raises where the learner cannot learn this problem
     experience: Experience | None = None
     n_skipped = 0
-    learner.start(problem)  # raises where the learner cannot learn this problem
     if not learner.needs_model:
-        shape = problem.n_states, problem.n_actions
-        if cfg.experience.name == "recorded":
-            recording = recorded(cfg.experience, problem.env, *shape, cfg.seed, problem.prior, safe_point)
-            experience, n_skipped = recording.held(), recording.n_skipped
-        else:
-            experience = collected_experience(cfg.experience, problem.source, *shape, rng, problem.prior, safe_point)
+        experience, n_skipped = make_experience(make_source(cfg.experience), problem, cfg.seed, safe_point)
         safe_point()
     title = Title(cfg.env.name, cfg.learner.name, cfg.seed)
-    recorder = SingleRecorder(learner, problem, experience, settings, rng.evaluation, title, n_skipped)
+    recorder = SingleRecorder(learner, problem, experience, settings, streams(cfg.seed).evaluation, title, n_skipped)
     n_experience = 0 if experience is None else len(experience)
     return Run(
         learner=learner,
@@ -195,7 +182,7 @@ def _replicas(
         one.start(problem)
     replicas = Replicas(tuple(learners), cfg.threads or os.cpu_count() or 1)
     seeds = [cfg.seed + i for _ in groups for i in range(cfg.n_replicas)]
-    experience = _experience(cfg, problem, seeds, safe_point)
+    experience = make_replica_experience(cfg, make_source(cfg.experience), problem, seeds, safe_point)
     title = Title(cfg.env.name, cfg.learner.name, cfg.seed)
     recorder = ReplicaRecorder(replicas, problem, experience, groups, seeds, vary, settings, title, safe_point)
     digest = None if isinstance(experience, Simulation) else [data.checksum() for data in streams_of(experience)]
@@ -215,45 +202,3 @@ def _with(learner: Any, group: Group) -> Any:
         return replace(learner, **group.settings)
     except InputError as error:
         raise error.within("vary") from error
-
-
-def _experience(cfg: DictConfig, problem: Problem, seeds: Sequence[int], safe_point: SafePoint) -> ReplicaExperience:
-    shared = cfg.shared_stream or cfg.experience.name == "recorded"
-    if shared and cfg.n_replicas > 1:
-        allowed = (
-            "1: on one stream, replicas with the same settings would be the same (let settings vary, vary.KEY=[...])"
-        )
-        raise InputError("n_replicas", cfg.n_replicas, allowed)
-    prior = problem.prior
-    if cfg.experience.name == "recorded":
-        recording = recorded(
-            cfg.experience, problem.env, problem.n_states, problem.n_actions, cfg.seed, prior, safe_point
-        )
-        if len(recording) * 24 > KEEP_BYTES:
-            most, n = KEEP_BYTES // 24, len(recording)
-            allowed = f"of at most {most:,} tuples, as replicas hold them in memory: it has {n:,}"
-            raise InputError("experience.path", recording.path, allowed)
-        return recording.load()
-    e = cfg.experience
-    if e.save_to is not None and not shared:
-        raise InputError("experience.save_to", e.save_to, "null: there is a stream a replica (or shared_stream=true)")
-    behaviour = None if e.behaviour_policy is None else read_npy(e.behaviour_policy, "experience.behaviour_policy")
-    if shared:
-        if e.save_to is not None:
-            check_target("experience.save_to", e.save_to)
-        data = collect(problem.source, e.n_episodes, e.episode_length, cfg.seed, behaviour, prior)
-        if e.save_to is not None:
-            check_target("experience.save_to", e.save_to)
-            save_columns(data, e.save_to) if e.save_to.endswith("/") else data.save(e.save_to)
-        return data
-    mdp = known_mdp(problem.source)
-    if mdp is not None:
-        if cfg.keep_tuples:
-            held = TUPLE_BYTES * len(seeds) * e.n_episodes * e.episode_length
-            checks.memory("keep_tuples", "true", held, f"the tuples of {len(seeds):,} replicas")
-        return Simulation(mdp, e.n_episodes, e.episode_length, seeds, behaviour, cfg.keep_tuples)
-    made: dict[int, Transitions] = {}
-    for seed in tqdm(sorted(set(seeds)), desc="collecting", unit=" streams", delay=1, leave=False, disable=None):
-        made[seed] = collect(problem.source, e.n_episodes, e.episode_length, seed, behaviour, prior)
-        safe_point()
-    return [made[seed] for seed in seeds]

@@ -1,0 +1,107 @@
+"""Classes by their dotted names: of a learner, an environment, a source of experience; their settings are arguments.
+
+Light to import: the command line offers the arguments of a class of one's own as keys.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+from collections.abc import Mapping
+from dataclasses import MISSING, fields, is_dataclass
+from typing import Any
+
+from omegaconf import BooleanNode, DictConfig, FloatNode, IntegerNode, OmegaConf, StringNode, ValidationError
+from omegaconf.errors import UnsupportedValueType
+
+from erl_torch.checks import InputError, out_of_memory
+from erl_torch.run.settings import KINDS
+
+GROUPS = ("env", "learner", "experience")  # of which a configuration can name the class
+NODES = {"float": FloatNode, "int": IntegerNode, "bool": BooleanNode, "str": StringNode}
+OF_EVERY_ENV = {"use_model": True, "on_end": "restart", "bins": None, "low": None, "high": None, "actions": None}
+
+
+def resolve(path: object, key: str) -> type:
+    """Import the class at the dotted ``path``. Raises InputError under ``key``."""
+    module, _, name = str(path).rpartition(".")
+    allowed = "the dotted name of a class, as in my_package.MyClass"
+    if not module:
+        raise InputError(key, path, allowed)
+    try:
+        found = getattr(importlib.import_module(module), name)
+    except Exception as error:  # of the import system, or whatever the module raises
+        if out_of_memory(error):
+            raise
+        raise InputError(key, path, f"{allowed} ({type(error).__name__}: {error})") from error
+    if not isinstance(found, type):
+        raise InputError(key, path, allowed)
+    return found
+
+
+def is_own(path: object) -> bool:
+    """Whether ``path`` is of this package, which every run directory may name."""
+    return str(path).startswith("erl_torch.")
+
+
+def foreign(cfg: DictConfig) -> dict[str, str]:
+    """The classes outside this package that ``cfg`` names, by key."""
+    paths = {f"{group}.class": cfg[group].get("class") for group in GROUPS if group in cfg}
+    return {key: str(path) for key, path in paths.items() if path is not None and not is_own(path)}
+
+
+def parameters(kind: type) -> dict[str, inspect.Parameter]:
+    """The arguments of ``kind`` that are settings, by name."""
+    of_call = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+    arguments = inspect.signature(kind).parameters.items()
+    return {name: one for name, one in arguments if name != "render_mode" and one.kind not in of_call}
+
+
+def offered(group: str, path: str) -> dict[str, Any]:
+    """The configuration of ``group`` with the class at ``path``: its arguments with their defaults.
+
+    An argument without default is ``???``; one whose default no configuration can hold is left to the class.
+    Raises InputError.
+    """
+    kind = resolve(path, f"{group}.class")
+    defaults = {n: "???" if p.default is p.empty else p.default for n, p in parameters(kind).items()}
+    if is_dataclass(kind):
+        defaults |= {f.name: f.default_factory() for f in fields(kind) if f.default_factory is not MISSING and f.init}
+    node: dict[str, Any] = {"class": path, "name": kind.__name__}
+    if group == "env":
+        node = {"defaults": ["/schema/suggest@suggest", "_self_"], **node, **OF_EVERY_ENV}
+    return node | {name: value for name, value in defaults.items() if _is_setting(value)}
+
+
+def _is_setting(value: object) -> bool:
+    try:
+        OmegaConf.create({"value": value})
+    except (UnsupportedValueType, ValidationError):
+        return False
+    return True
+
+
+def settings_of(values: Mapping[str, Any], kind: type, others: tuple[str, ...]) -> dict[str, Any]:
+    """The arguments of ``kind`` among ``values``, as numbers, truth values and text where it says that it takes these.
+
+    Raises InputError for a key that is neither an argument nor one of ``others``, and for a value of another type.
+    """
+    takes = parameters(kind)
+    for key, value in values.items():
+        if key not in takes and key not in others:
+            raise InputError(key, value, f"left out: no such key; there are {', '.join(takes)}")
+    return {key: _typed(key, value, takes[key].annotation) for key, value in values.items() if key in takes}
+
+
+def _typed(key: str, value: object, annotation: object) -> Any:
+    text = annotation if isinstance(annotation, str) else inspect.formatannotation(annotation)
+    types = {one.strip() for one in text.split("|")}
+    if len(types - {"None"}) != 1 or not types <= {*NODES, "None"}:
+        return value  # the class looks at it
+    (kind,) = types - {"None"}
+    if value is None and "None" in types:
+        return None
+    try:
+        return NODES[kind](value, is_optional=False)._value()
+    except ValidationError as error:
+        raise InputError(key, value, KINDS[kind] + ", or null" * ("None" in types)) from error
