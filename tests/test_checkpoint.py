@@ -145,8 +145,8 @@ def test_other_settings_are_refused_by_name(cut):
         train(other, directory)
     said = str(error.value)
     assert said.startswith(f"hydra.run.dir={directory}: must be of a run with these settings, or a new one: not ")
-    assert "env.trap_reward=-4.0 (there: -5.0)" in said
-    assert "learner.beta=5.0 (there: 10.0)" in said
+    assert "env.trap_reward=-4 (there: -5.0)" in said
+    assert "learner.beta=5 (there: 10.0)" in said
     assert "threads" not in said  # results do not depend on it
     assert {path: path.read_bytes() for path in directory.rglob("*") if path.is_file()} == before
 
@@ -159,7 +159,7 @@ def test_checkpoints_know_their_settings(tmp_path, cut):
     cfg, directory, _ = cut
     (directory / "settings.json").unlink()
     before = files(directory)
-    with pytest.raises(InputError, match=r"not learner\.beta=7\.0 \(there: 10\.0\)"):
+    with pytest.raises(InputError, match=r"not learner\.beta=7 \(there: 10\.0\)"):
         train(composed(*SMALL, *SHORT["s1"], "learner.beta=7"), directory)
     assert files(directory) == before
     train(cfg, directory)
@@ -273,7 +273,9 @@ def test_any_error_keeps_what_was_learnt(tmp_path, monkeypatch, error, place, re
     train(cfg, tmp_path / "whole")
     target, name = {
         "learner": (AlgorithmS1, "step") if not replicas else (Replicas, "iterate"),
-        "evaluation": ("erl_torch.run.replicas.Judges", "__call__") if replicas else ("erl_torch.run.single", "evaluate"),
+        "evaluation": ("erl_torch.run.replicas.Judges", "__call__")
+        if replicas
+        else ("erl_torch.run.single", "evaluate"),
         "log": ("erl_torch.log.tensorboard.Board", "scalars"),
     }[place]
     if isinstance(target, str):
@@ -316,7 +318,7 @@ def test_an_error_after_the_learning_keeps_it(tmp_path, monkeypatch):
     def failing(*_):
         raise MemoryError
 
-    monkeypatch.setattr("erl_torch.run.training.certify", failing)
+    monkeypatch.setattr("erl_torch.run.single.certify", failing)
     with pytest.raises(MemoryError):
         train(composed(*SMALL, *SHORT["s1"]), tmp_path)
     assert json.loads((tmp_path / "result.json").read_text())["status"] == "completed"
@@ -327,7 +329,7 @@ def test_a_certificate_beyond_memory_is_named(tmp_path, monkeypatch):
     def failing(*_):
         raise MemoryError("SuperLU: not enough memory")
 
-    monkeypatch.setattr("erl_torch.run.training.solve_soft_bellman", failing)
+    monkeypatch.setattr("erl_torch.run.single.solve_soft_bellman", failing)
     with pytest.raises(
         InputError, match=r"^evaluation.certify=true: must be false: .* needs more memory than there is"
     ):

@@ -238,7 +238,7 @@ class SingleRecorder:
         return {
             "env": self.title.env,
             "learner": self.title.learner,
-            "beta": self.learner.beta,
+            "beta": float(self.learner.beta),
             "seed": self.title.seed,
             "status": solution.status.name.lower(),
             "message": solution.message,
