@@ -2,7 +2,6 @@
 
 import contextlib
 import shutil
-import subprocess
 import sys
 from dataclasses import replace
 from functools import partial
@@ -11,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers import ROOT, composed
+from helpers import ROOT, composed, ended
 from omegaconf import OmegaConf
 from PIL import Image
 
@@ -237,20 +236,14 @@ def test_solutions_with_a_wrong_field_are_refused(cliff, tmp_path, field):
         ReplicaSolution.load(tmp_path / "r.npz")
 
 
-def test_command_line(cliff, tmp_path):
+def test_command_line(cliff, tmp_path, start):
     for overrides, code, out, err in [
         ((f"run={cliff}", "render=none", "n_episodes=2"), 0, "windy_cliff, exact, seed 0", ""),
         (("run=nowhere",), 1, "", "error: run=nowhere: must be a run directory"),
     ]:
-        done = subprocess.run(
-            [sys.executable, str(ROOT / "play.py"), *overrides],
-            cwd=tmp_path,
-            capture_output=True,
-            text=True,
-            timeout=120,
-        )
-        assert done.returncode == code, done.stderr
-        assert done.stdout.startswith(out)
-        assert done.stderr.startswith(err)
-        assert done.stderr.count("\n") == code
+        found = ended(start(sys.executable, ROOT / "play.py", *overrides, cwd=tmp_path))
+        assert found[0] == code, found
+        assert found[1].startswith(out)
+        assert found[2].startswith(err)
+        assert found[2].count("\n") == code
     assert not list(tmp_path.iterdir())  # nothing of its own is left

@@ -1,20 +1,17 @@
 """Whole runs: what a run directory holds, what is logged, and that bits repeat."""
 
-import contextlib
 import json
 import os
 import re
 import signal
-import subprocess
 import sys
-import time
 from concurrent.futures import ThreadPoolExecutor
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from helpers import ROOT, composed, events, random_mdp, undocumented
+from helpers import ROOT, composed, ended, events, random_mdp, undocumented, wait_until
 from omegaconf import OmegaConf
 
 from erl_torch import InputError, Solution, Status, Transitions, evaluate
@@ -216,34 +213,30 @@ ENDLESS = ("learner.n_epochs=100000", "evaluation.pictures=false")
 
 
 @pytest.fixture(scope="module")
-def typed(tmp_path_factory):
+def typed(tmp_path_factory, start_for_all):
     """(process, its directory) of each command below; started together, they share the cores."""
     commands = {
         "endless": ENDLESS,
         "sweep": ("-m", "learner.beta=2,-1,5", "seed=0,1", *SMALL, "evaluation.pictures=false"),
         "run": ("env=windy_cliff", *SMALL, "evaluation.pictures=false"),
     }
-    with contextlib.ExitStack() as stack:
-        started = {}
-        for name, arguments in commands.items():
-            directory = tmp_path_factory.mktemp("typed")
-            process = subprocess.Popen(
-                [sys.executable, str(ROOT / "train.py"), *arguments],
-                cwd=directory, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-            )  # fmt: skip
-            stack.enter_context(process)
-            stack.callback(process.kill)
-            started[name] = process, directory
-        yield started
+    started = {}
+    for name, arguments in commands.items():
+        directory = tmp_path_factory.mktemp("typed")
+        started[name] = start_for_all(sys.executable, ROOT / "train.py", *arguments, cwd=directory), directory
+    return started
+
+
+def learning(cwd):
+    """Whether the run below ``cwd`` has written what an epoch made."""
+    paths = list(cwd.rglob("events.*"))
+    reader = events(paths[0]) if paths else None
+    return reader and "s1/theta" in reader.Tags()["scalars"] and reader.Scalars("s1/theta")[-1].step > 0
 
 
 def signalled(cwd, send):
-    """Call ``send`` once the run below ``cwd`` is well inside its epochs."""
-    deadline = time.monotonic() + 120
-    while time.monotonic() < deadline and not list(cwd.rglob("events.*")):
-        time.sleep(0.05)
-    assert list(cwd.rglob("events.*"))
-    time.sleep(0.5)
+    """Call ``send`` once the run below ``cwd`` is inside its epochs."""
+    wait_until(lambda: learning(cwd), "an epoch")
     send()
 
 
@@ -253,7 +246,7 @@ def test_termination_keeps_what_was_learnt(typed, typed_here, tmp_path, number):
     if number == signal.SIGTERM:
         process, cwd = typed["endless"]
         signalled(cwd, lambda: process.send_signal(number))
-        (out, _), code = process.communicate(timeout=60), process.returncode
+        code, out, _ = ended(process)
     else:
         cwd = tmp_path
         with ThreadPoolExecutor(1) as pool:
@@ -273,8 +266,8 @@ def test_termination_keeps_what_was_learnt(typed, typed_here, tmp_path, number):
 
 def test_command_line_run(typed):
     process, cwd = typed["run"]
-    out, err = process.communicate(timeout=120)
-    assert process.returncode == 0, err
+    code, out, err = ended(process)
+    assert code == 0, err
     (directory,) = (cwd / "runs" / "windy_cliff").iterdir()
     assert {".hydra", "result.json", "solution.npz"} < {p.name for p in directory.iterdir()}
     assert f"runs/windy_cliff/{directory.name}" in out
@@ -288,8 +281,8 @@ def test_command_line_run(typed):
 def test_multirun_writes_one_named_directory_a_job(typed):
     """The job that cannot run says so and leaves nothing; the others finish."""
     process, cwd = typed["sweep"]
-    _, err = process.communicate(timeout=120)
-    assert process.returncode == 1
+    code, _, err = ended(process)
+    assert code == 1
     (sweep,) = (cwd / "runs" / "windy_cliff").iterdir()
     assert sweep.name.startswith("sweep-")
     names = [p.name.split("-pictures")[0] for p in sorted(sweep.iterdir()) if p.is_dir()]
@@ -377,17 +370,15 @@ def test_resume_takes_only_what_a_run_begins_with(typed_here, tmp_path, monkeypa
         assert typed_here("train.py", "resume=run", "env=mine:Id-v0")[0] == "imported"
 
 
-def test_help_is_complete_and_needs_no_torch(tmp_path):
-    done = subprocess.run(
-        [sys.executable, str(ROOT / "train.py"), "--help"],
-        cwd=tmp_path, capture_output=True, text=True, timeout=120, env={**os.environ, "PYTHONPROFILEIMPORTTIME": "1"},
-    )  # fmt: skip
-    assert done.returncode == 0
+def test_help_is_complete_and_needs_no_torch(tmp_path, start):
+    environment = {**os.environ, "PYTHONPROFILEIMPORTTIME": "1"}
+    code, out, err = ended(start(sys.executable, ROOT / "train.py", "--help", cwd=tmp_path, env=environment))
+    assert code == 0
     for text in ("python train.py env=windy_cliff", "windy_cliff,windy_frozen_lake", "lr_psi: 0.1", "conf/"):
-        assert text in done.stdout
-    assert " gymnasium\n" in done.stderr
+        assert text in out
+    assert " gymnasium\n" in err
     for module in (" torch\n", " numba\n", " scipy\n", " matplotlib\n"):
-        assert module not in done.stderr
+        assert module not in err
     assert not (tmp_path / "runs").exists()
 
 
