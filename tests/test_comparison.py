@@ -202,7 +202,7 @@ def test_run_directory(finished):
 
 
 def test_experience_is_that_of_train(finished):
-    from erl_torch.experience.collect import known_mdp
+    from erl_torch.mdp.from_gymnasium import known_mdp
     from erl_torch.run.build import make_env
 
     mdp = known_mdp(make_env(composed().env))

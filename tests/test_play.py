@@ -6,6 +6,7 @@ import sys
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -51,7 +52,8 @@ def cliff(tmp_path_factory):
 
 def test_returns_are_those_of_the_model(cliff, capsys):
     played = play(arguments(f"run={cliff}", "n_episodes=200", "render=none"))
-    mdp = make_env(composed().env).unwrapped.mdp
+    env: Any = make_env(composed().env).unwrapped
+    mdp = env.mdp
     expected = 200 * reward_per_step(mdp, Solution.load(cliff / "solution.npz").policy.numpy(), 200)
     error = played.returns.std() / np.sqrt(200)
     assert abs(played.returns.mean() - expected) < 4.5 * error
@@ -85,10 +87,10 @@ def test_gif(cliff, capsys):
     assert str(path) in capsys.readouterr().out
     with Image.open(path) as picture:
         # Equal pictures in a row become one that stays longer.
-        assert 1 < picture.n_frames <= len(played.shown) == 6
+        assert 1 < picture.n_frames <= len(played.shown) == 6  # type: ignore[attr-defined]  # of gifs
         assert picture.size == played.shown[0].shape[1::-1]
         total = 0
-        for frame in range(picture.n_frames):
+        for frame in range(picture.n_frames):  # type: ignore[attr-defined]
             picture.seek(frame)
             total += picture.info["duration"]
         assert total == 6 * 250  # four steps a second
@@ -124,7 +126,7 @@ def test_greedy_takes_the_most_probable_action(cliff, tmp_path):
 def test_environments(cliff, tmp_path, capsys, env, n_states, n_actions, render):
     cfg = composed(f"env={env}")
     if n_states is None:
-        spaces = make_env(cfg.env)
+        spaces: Any = make_env(cfg.env)
         n_states, n_actions = spaces.observation_space.n, spaces.action_space.n
     run = copy(cliff, tmp_path / "run", np.full((n_states, n_actions), 1 / n_actions), f"env={env}")
     played = play(arguments(f"run={run}", "n_episodes=1", f"render={render}", "n_steps=2"))
@@ -178,19 +180,19 @@ def test_bad_runs_get_one_line(cliff, tmp_path):
     for i, (text, expected) in enumerate(
         [
             (None, "No such file"),
-            ("env: [", "while parsing"),
-            ("- 3", "config.yaml ("),
-            ("seed: 0", "Missing key env"),
-            ("env: {name: x}\nlearner: {name: s1}\nevaluation: {horizon: 1}", "Missing key id"),
+            (b"env: [", "while parsing"),
+            (b"- 3", "config.yaml ("),
+            (b"seed: 0", "Missing key env"),
+            (b"env: {name: x}\nlearner: {name: s1}\nevaluation: {horizon: 1}", "Missing key id"),
             (b"\xff\xfe\xfa", "config.yaml ("),
-            ("a: ${b}", "config.yaml ("),
+            (b"a: ${b}", "config.yaml ("),
         ]
     ):
         run = tmp_path / str(i)
         shutil.copytree(cliff, run)
         (run / ".hydra" / "config.yaml").unlink()
         if text is not None:
-            (run / ".hydra" / "config.yaml").write_bytes(text if isinstance(text, bytes) else text.encode())
+            (run / ".hydra" / "config.yaml").write_bytes(text)
         line = complaint(f"run={run}")
         assert line.startswith(f"run={run}: must be a run directory with the configuration")
         assert expected in line

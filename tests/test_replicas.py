@@ -3,6 +3,7 @@
 import json
 import tracemalloc
 from dataclasses import replace
+from typing import Any
 
 import hypothesis
 import numpy as np
@@ -102,7 +103,11 @@ def test_bits_of_replicas_are_those_of_single_runs(small, alone, how):
 def test_bits_on_a_shared_stream(small, how, noisy):
     """A sweep: temperatures and step sizes of their own, one stream."""
     data = small[2 if noisy else 1][1]
-    vectors = {"beta": np.linspace(0.5, 6, 9), "lr_u": np.geomspace(0.001, 0.4, 9), "lr_psi": [0.1, 0.3, 1.0] * 3}
+    vectors: dict[str, Any] = {
+        "beta": np.linspace(0.5, 6, 9),
+        "lr_u": np.geomspace(0.001, 0.4, 9),
+        "lr_psi": [0.1, 0.3, 1.0] * 3,
+    }
     learner = AlgorithmS1(n_epochs=2, n_bias=3)
     found = Replicas.of(learner, **vectors, **how).fit(data, 6, 3)
     assert found.policy.shape == (9, 6, 3)

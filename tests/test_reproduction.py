@@ -119,14 +119,14 @@ def test_outputs_can_be_written_and_name_every_published_number(outputs, tmp_pat
         for c, row in zip(output.comparisons, about["comparisons"], strict=True):
             given = {"printed": row["printed"], "read off": row["read off"], "computed": row["computed"]}
             assert [name for name, value in given.items() if value is not None] == [COLUMNS[c.source]]
-    wanted = {
+    wanted: dict[str, list[float]] = {
         "figure_4": [-756.59, -1000.0, -946.76, -997.14, -947.14],
         "figure_5": [-1.29, -0.985, -0.957, -0.966, -0.966, -1.626, -0.956],
         "table_s2": [28, 38, 29, 58],
     }
     for name, numbers in wanted.items():
-        given = [c.reference for c in outputs[name].comparisons]
-        assert all(given.count(number) >= numbers.count(number) for number in numbers)
+        references = [c.reference for c in outputs[name].comparisons]
+        assert all(references.count(number) >= numbers.count(number) for number in numbers)
 
 
 def test_exact_numbers(outputs):

@@ -264,7 +264,7 @@ def test_slurm_jobs_without_a_result_are_queued_again_once(tmp_path, monkeypatch
         return {"any": "GONE", "7_0": "COMPLETED", "7_1": first, "7_2": "OUT_OF_MEMORY", "7_3": "CANCELLED"}
 
     monkeypatch.setattr(sweeps, "ASK_SLURM", 0)
-    monkeypatch.setattr(sweeps.time, "sleep", lambda _: None)
+    monkeypatch.setattr("time.sleep", lambda _: None)
     monkeypatch.setattr(sweeps, "_slurm_states", states)
     monkeypatch.setattr(sweeps, "_requeue", lambda job: requeued.append(job) is None and job != "7_4")
     sweeps._wait(tmp_path, {number: SlurmJob(number) for number in range(5)})
