@@ -346,6 +346,7 @@ def test_a_solution_of_a_discounted_learner_has_no_theta(tmp_path, cliff):
         found.value_functions(n_steps=5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(name for name, learner in LEARNERS.items() if hasattr(learner, "fit")))
 def test_learners_share_one_interface(cliff, name):
     _, data = cliff

@@ -32,6 +32,7 @@ def all_tuples(mdp):
 # -- the authors' script --------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
 def test_gives_what_the_authors_script_gives(authors, authors_tuples, implementation):
     learner = AlgorithmS1(

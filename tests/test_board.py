@@ -19,6 +19,7 @@ from erl_torch.run.report import where
 from erl_torch.run.training import train
 from erl_torch.solvers import certify
 
+pytestmark = pytest.mark.slow  # whole runs
 SMALL = ("experience.n_episodes=20", "learner.n_epochs=2")
 
 

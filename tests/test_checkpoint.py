@@ -16,6 +16,7 @@ from erl_torch.log.event_file import EventFile
 from erl_torch.run.checkpoint import Checkpoints, decode, encode
 from erl_torch.run.training import train
 
+pytestmark = pytest.mark.slow  # whole runs
 SMALL = (
     "experience.n_episodes=3",
     "evaluation.n_episodes=2",

@@ -132,6 +132,7 @@ def test_every_learner_has_the_same_experience(problem):
     assert found.status["s1"] == [["completed"] * 2] * 2
 
 
+@pytest.mark.slow
 def test_processes_change_nothing(problem):
     mdp, prior = problem
     one, two = (compare(mdp, learners(prior), 2, 500, 2, None, prior, processes=n) for n in (1, 2))

@@ -69,6 +69,7 @@ def cell_of(task, bins, state):
     return np.ravel_multi_index([np.digitize(v, e) for v, e in zip(x, edges, strict=True)], bins.bins, order="F")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CONTROL_TASKS)
 def test_steps_are_gymnasiums(name):
     """10,000 states on and beyond the binned box."""
@@ -150,6 +151,7 @@ def equal(one, other):
     return one.reward_shift == other.reward_shift and all(np.array_equal(a, b) for a, b in pairs)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CONTROL_TASKS)
 def test_model_does_not_depend_on_the_workers(name):
     n_samples = 40_000 // SMALL[name] ** 2  # several chunks
@@ -252,6 +254,7 @@ def test_works_without_a_cache_folder(tmp_path, monkeypatch):
     assert estimate.cache_folder() == tmp_path / "erl_torch"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "theta", "deviation", "seeds"),
     [("pendulum", 3.338, 0.095, 20), ("mountain_car", 0.0400, 0.0067, 20), ("cart_pole", 0.1660, 0.0017, 3)],

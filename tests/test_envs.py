@@ -63,6 +63,7 @@ def test_rows_sum_to_one_and_every_state_is_a_state(make, env_id):
     assert (mdp.transition.data > 0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env_id", MODELS)
 def test_steps_follow_the_model(make, env_id):
     steps_follow_the_model(make(env_id).unwrapped)

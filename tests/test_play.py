@@ -110,6 +110,7 @@ def test_greedy_takes_the_most_probable_action(cliff, tmp_path):
         play(arguments(f"run={run}", "render=gif"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("env", "n_states", "n_actions", "render"),
     [
@@ -140,6 +141,7 @@ def test_environments(cliff, tmp_path, capsys, env, n_states, n_actions, render)
         assert played.ended.all()
 
 
+@pytest.mark.slow
 def test_latest_and_replicas(cliff, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError, match="run=latest: must be a run directory: there is no run below runs/"):

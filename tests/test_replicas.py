@@ -82,6 +82,7 @@ def alone(request, small):
     return learner, *([learner.fit(d, 6, 3) for d in streams_] for streams_ in small[1:])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", HOW, ids=lambda how: "-".join(f"{k}={v}" for k, v in how.items()))
 def test_bits_of_replicas_are_those_of_single_runs(small, alone, how):
     (mdp, data, noisy), (learner, plain, varied) = small, alone
@@ -139,6 +140,7 @@ def test_bits_of_any_mixture(problem, rates, block, layout, keep, episode, behav
         assert_same(found[r], own.fit(data, *prior.shape))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(set(LEARNERS) - {"exact", "s1"}))
 def test_every_learner_has_replicas(small, name):
     """All that stream, on every kind of experience; betas of their own."""
@@ -458,6 +460,7 @@ def test_lines_of_optimum_and_prior(finished):
     assert gap.value == pytest.approx(group["exact"]["objective"] - group["objective"]["mean"], abs=1e-6)
 
 
+@pytest.mark.slow
 def test_settings_that_vary(tmp_path, monkeypatch):
     titles, draw = set(), pictures.bands
     monkeypatch.setattr(
@@ -480,6 +483,7 @@ def test_settings_that_vary(tmp_path, monkeypatch):
         assert group["exact"]["theta"] == pytest.approx(solve_soft_bellman(mdp, group["beta"]).theta, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_improved_learner_on_a_recorded_stream(tmp_path):
     collect(random_mdp(np.random.default_rng(2), 4, 2), 5, 100, 0).save(tmp_path / "t.npz")
     mdp = random_mdp(np.random.default_rng(2), 4, 2)

@@ -102,6 +102,7 @@ def outputs(tmp_path_factory):
     return {name: load(name).assemble(its, "quick") for name, its in results.items()}
 
 
+@pytest.mark.slow
 def test_outputs_can_be_written_and_name_every_published_number(outputs, tmp_path, monkeypatch):
     monkeypatch.setattr(runner, "DPI", 30)
     for name, output in outputs.items():
@@ -129,6 +130,7 @@ def test_outputs_can_be_written_and_name_every_published_number(outputs, tmp_pat
         assert all(references.count(number) >= numbers.count(number) for number in numbers)
 
 
+@pytest.mark.slow
 def test_exact_numbers(outputs):
     """Everything that does not hang on a sample meets its oracle."""
     for name in ("figure_1", "figure_2", "figure_4"):

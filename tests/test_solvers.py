@@ -157,6 +157,7 @@ def refined_gain(mdp, beta, prior, value):
     return error.min(), error.max()
 
 
+@pytest.mark.slow
 def test_a_thousand_certificates():
     """Every bound contains the extended-precision answer and is narrower than 1e-9; G never rises."""
     for seed in range(1000):

@@ -91,6 +91,7 @@ def test_interval_of_the_data(finished):
     assert ends == pytest.approx([low, high], abs=1.1e-3)  # rounded outward
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("learner", sorted(set(LEARNERS) - {"s1", "exact"}))
 def test_every_learner_runs(tmp_path, learner):
     passes = [] if learner == "certainty_equivalence" else ["learner.n_epochs=2"]
@@ -155,6 +156,7 @@ def test_environment_without_a_model(tmp_path):
     assert events(tmp_path).Images("policy")[-1].height == 400
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["biasing", "soft_bellman"])
 def test_exact_learner(tmp_path, method):
     result = train(composed("learner=exact", f"learner.method={method}", "experience.n_episodes=1"), tmp_path)
@@ -382,6 +384,7 @@ def test_help_is_complete_and_needs_no_torch(tmp_path, start):
     assert not (tmp_path / "runs").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("overrides", "better"),
     [
@@ -413,6 +416,7 @@ def test_episodes_that_end_are_learnt_as_restarts(tmp_path):
     assert episodic["return"] > endless["return"]  # shorter
 
 
+@pytest.mark.slow
 def test_mdp_files_and_their_pictures(tmp_path):
     path = random_mdp(np.random.default_rng(0), 5, 3).save(tmp_path / "mdp.npz")
     result = train(composed("env=mdp", f"env.path={path}", *SMALL), tmp_path / "run")
@@ -463,6 +467,7 @@ def test_environments_by_id(given, expected):
     assert cli._by_id(given, ROOT / "conf") == expected
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stream", ["model", "episodes"])
 def test_control_tasks_are_learnt(tmp_path, monkeypatch, stream):
     """Pendulum on few samples: the learnt policy's return in the original lies far above the prior's."""
