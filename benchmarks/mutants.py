@@ -1895,7 +1895,7 @@ def _tested(nodes: list[str], tree: Path, said: Path) -> None:
     sys.dont_write_bytecode = True
     sys.path[:] = [str(tree), *(entry for entry in sys.path if Path(entry or ".").resolve() not in (ROOT, HERE))]
     # Plain asserts: what is imported already cannot be rewritten.
-    options = ["-x", "-p", "no:cacheprovider", "--hypothesis-profile=unshrunk", "--tb=short", "--assert=plain"]
+    options = ["-x", "-n0", "-p", "no:cacheprovider", "--hypothesis-profile=unshrunk", "--tb=short", "--assert=plain"]
     sys.exit(int(pytest.main([*options, *nodes])))
 
 

@@ -3,6 +3,7 @@
 import json
 import pydoc
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from erl_torch.log.event_file import EventFile
 from erl_torch.run.checkpoint import COMMON, Checkpoints, decode, encode
 from erl_torch.run.training import train
 
+pytestmark = pytest.mark.slow  # whole runs
 SMALL = (
     "experience.n_episodes=3",
     "evaluation.n_episodes=2",
@@ -409,6 +411,7 @@ def test_settings_that_are_new_or_gone_are_refused(tmp_path):
 def test_values_come_back_as_they_were():
     learner = AlgorithmS1(beta=10.0, lr_u=0.5, lr_rho=1e-3, n_epochs=2, n_bias=1)
     mdp = random_mdp(np.random.default_rng(0), 3, 2)
+    state: Any
     *_, state = Replicas.of(learner, 2).iterate(Simulation(mdp, 1, 100, range(2)), 3, 2)
     error = NonFiniteError(3, "why")
     solution = learner.fit(collect(mdp, 1, 100, 0), 3, 2)

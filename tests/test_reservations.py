@@ -115,11 +115,13 @@ def having(lines, *texts):
 # -- end to end -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["true", "fuzz", "single"])
 def test_a_true_recording_has_no_note(tmp_path, recordings, name):
     assert notes(tmp_path, *of_stream(recordings[name]), learner=("evaluation.pictures=false",)) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("learner", "concerned"),
     [
@@ -306,6 +308,7 @@ def test_theta_far_from_the_data_is_counted_in_half_widths():
     assert math.isnan(half_widths(1.9, withheld))
 
 
+@pytest.mark.slow
 def test_published_s1_at_a_high_temperature_is_far_off_and_says_so(tmp_path, capsys):
     """Beta 2: its constant steps end tens of half widths from the data; each replica says what its run alone says."""
     full = ("learner.beta=2", "evaluation.pictures=false")
@@ -360,6 +363,7 @@ BUILT_IN = (
 )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env", BUILT_IN)
 def test_built_in_environments(tmp_path, env):
     """Their data have no reservation but for states never met, where there are. (Two passes may well end worse than the
