@@ -40,10 +40,10 @@ from erl_torch.solvers import policy as exact_policy  # noqa: E402
 try:
     from erl_torch.solvers import certificates
 except ImportError:  # an earlier package
-    certificates = None  # type: ignore[assignment]
+    certificates = None
 
 # Biasing iterations that converge have done so by then; 200 of those that do not take seconds.
-SOLVERS = {"soft policy iteration": solve_soft_bellman, "biasing": partial(solve_biasing, max_steps=50)}
+SOLVERS: dict[str, Any] = {"soft policy iteration": solve_soft_bellman, "biasing": partial(solve_biasing, max_steps=50)}
 TOL = 1e-10  # of the solvers, by default
 ORACLE_SECONDS = 60
 COUNTED = ("problems", "violations", "died", "no oracle", "infinite bounds", "no gap")  # columns

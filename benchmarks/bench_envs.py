@@ -19,6 +19,7 @@ import subprocess
 import sys
 import time
 from collections import deque
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -35,7 +36,7 @@ FEW = 2000  # env.step's share of a round
 def by_stepping(task: ControlTask) -> float:
     """CPU seconds a step of Gymnasium's env.step, states uniform in the binned box."""
     rng = np.random.default_rng(0)
-    env = gym.make(task.gymnasium_id).unwrapped
+    env: Any = gym.make(task.gymnasium_id).unwrapped
     env.reset(seed=0)
     states = list(rng.uniform(task.low, task.high, (FEW, len(task.low))))
     if isinstance(env.action_space, gym.spaces.Box):

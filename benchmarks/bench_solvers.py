@@ -18,6 +18,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -66,7 +67,7 @@ def bench_pair() -> None:
         mdp = windy_grid(n)
         for beta in (0.1, 1.0, 5.0, 50.0):
             matrix = tilted(mdp, beta)
-            seconds = median_seconds(lambda matrix=matrix: perron(matrix))
+            seconds = median_seconds(partial(perron, matrix))
             pair = perron(matrix)
             spread = pair.bounds[1] - pair.bounds[0]
             print(f"| {n * n} | {beta:g} | {seconds * 1e3:.1f} | {spread:.0e} | {pair.n_steps} | {pair.status.name} |")

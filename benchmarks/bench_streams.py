@@ -14,6 +14,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -36,12 +37,16 @@ def timed(name: str, n: int, work: Callable[[], Any]) -> Any:
     return found
 
 
+def passed(learner: Any, stream: Any) -> None:
+    learner.step(learner.init(15, 4), stream)
+
+
 def learn(data: Any) -> None:
     n = len(data)
     timed("certainty equivalence", n, lambda: CertaintyEquivalence().fit(data, 15, 4))
     for learner in (AlgorithmS1(n_epochs=1, n_bias=1), DifferentialSoftQ(n_epochs=1)):
-        stream = timed(f"{type(learner).__name__}, prepare", n, lambda one=learner: one.prepare(data, 15, 4))
-        timed(f"{type(learner).__name__}, pass", n, lambda one=learner, s=stream: one.step(one.init(15, 4), s))
+        stream = timed(f"{type(learner).__name__}, prepare", n, partial(learner.prepare, data, 15, 4))
+        timed(f"{type(learner).__name__}, pass", n, partial(passed, learner, stream))
 
 
 def main(path: str, n: int) -> None:

@@ -348,7 +348,7 @@ def directories(n: int = 3000, seed: int = 0) -> None:
 
 def templates(folder: Path) -> dict[str, tuple[Any, Path, dict[str, bytes]]]:
     """By name: configuration, directory, and the results of a run that was left alone."""
-    pictures.bands = lambda *_, **__: np.zeros((2, 2, 3), np.uint8)  # type: ignore[assignment]  # most of the time
+    pictures.bands = lambda *_, **__: np.zeros((2, 2, 3), np.uint8)  # most of the time
     found: dict[str, tuple[Any, Path, dict[str, bytes]]] = {}
     base = [*CHEAP, "evaluation.pictures=false", "checkpoint_every=0", "learner.n_bias=2", "learner.n_epochs=3"]
     for name, more in {"single": [], "replicas": ["n_replicas=2"], "exact": ["learner=exact"]}.items():

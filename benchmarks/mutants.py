@@ -1784,7 +1784,7 @@ MUTANTS = [
     ),
     Mutant(
         "replicas of a seed are held against the first one's beta",
-        "run/replicated.py",
+        "run/replicas.py",
         "held[r] = data_of(here, learners[r])",
         "held[r] = data_of(here, learners[0])",
         "test_reservations.py::test_each_replica_of_a_seed_is_held_against_the_data_at_its_own_beta",
@@ -1895,7 +1895,7 @@ def _tested(nodes: list[str], tree: Path, said: Path) -> None:
     sys.dont_write_bytecode = True
     sys.path[:] = [str(tree), *(entry for entry in sys.path if Path(entry or ".").resolve() not in (ROOT, HERE))]
     # Plain asserts: what is imported already cannot be rewritten.
-    options = ["-x", "-p", "no:cacheprovider", "--hypothesis-profile=unshrunk", "--tb=short", "--assert=plain"]
+    options = ["-x", "-n0", "-p", "no:cacheprovider", "--hypothesis-profile=unshrunk", "--tb=short", "--assert=plain"]
     sys.exit(int(pytest.main([*options, *nodes])))
 
 

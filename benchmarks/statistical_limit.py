@@ -403,7 +403,7 @@ def write_coverage(command: str, n: int, *found: list[tuple[list[Any], int, int]
     rows: list[list[Any]] = []
     for what, part in zip(("settled on", "fresh"), found, strict=True):
         rows += [[what, *row] for row, _, _ in part]
-        given, hits = (sum(x[k] for x in part) for k in (1, 2))
+        given, hits = sum(x[1] for x in part), sum(x[2] for x in part)
         rows.append([what, "all", "", "", f"{n * len(part) - given}", f"{hits / given:.3f}", "", "", "", ""])
     header = ["", "problem", "beta", "tuples", "withheld", "coverage", "theta above", "theta below", "width"]
     text = f"""coverage of the 95% interval of theta

@@ -1,4 +1,4 @@
-"""Names that load on first use, so that importing a package stays light."""
+"""Load a package's names on first use, so that its import stays light."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from typing import NamedTuple
 class Renamed(NamedTuple):
     """An old name that still loads."""
 
-    module: str  # where it is, relative to the package
-    name: str  # what it is called there
-    instead: str  # what to write today
+    module: str  # its module, relative to the package
+    name: str  # its name there
+    instead: str  # the name to use today
 
 
 def loader(
@@ -28,11 +28,10 @@ def loader(
         old = (renamed or {}).get(name)
         if old is not None:
             warnings.warn(f"{package}.{name} is deprecated: use {old.instead}", DeprecationWarning, stacklevel=2)
-            value: object = getattr(importlib.import_module(f"{package}.{old.module}"), old.name)
-            return value
-        if name not in home:
+        elif name not in home:
             raise AttributeError(f"module '{package}' has no attribute '{name}'")
-        value = getattr(importlib.import_module(f"{package}.{home[name]}"), name)
+        module, attribute = (home[name], name) if old is None else (old.module, old.name)
+        value: object = getattr(importlib.import_module(f"{package}.{module}"), attribute)
         return value
 
     return load

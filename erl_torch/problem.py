@@ -26,6 +26,7 @@ class Problem:
         mdp: the model that policies are evaluated on, and that is solved to compare with; None where it is not known.
         episode: the model of one episode: its end is absorbed, without reward; None where there is none.
         horizon: steps of an episode at most, >= 1.
+        name: what messages and pictures call it.
     """
 
     env: gym.Env[Any, Any]
@@ -34,6 +35,7 @@ class Problem:
     mdp: TabularMDP | None = None
     episode: TabularMDP | None = None
     horizon: int = 1000
+    name: str = "the environment"
 
     @property
     def n_states(self) -> int:

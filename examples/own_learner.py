@@ -1,12 +1,13 @@
-"""A learner of your own: with five methods, the loops, replicas and certificates work. This is soft value iteration."""
+"""A learner of your own: with five methods, the loops, runs, replicas and certificates work. This is soft value
+iteration on the counts of the stream."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 
 import erl_torch
 from erl_torch.envs.windy_cliff import WindyCliffEnv
-from erl_torch.learners.learner import epochs, run_to_end
 
 
 @dataclass(frozen=True)
@@ -16,20 +17,27 @@ class SweepState:
     theta: float  # reward a step
     value: torch.Tensor  # [S]
     q: torch.Tensor  # [S, A], r + E V
+    beta: float
+    reward_bias: ClassVar[None] = None  # it has none
+
+    @property
+    def policy(self):  # of a uniform prior
+        return (self.beta * self.q).softmax(1)
 
     def metrics(self):
         return {"theta": self.theta, "epoch": self.epoch, "n_tuples": self.n_tuples}
 
 
 @dataclass(frozen=True)
-class SoftValueIteration:
+class SoftValueIteration(erl_torch.Streaming):
+    states: ClassVar = (SweepState,)  # what a checkpoint may hold
     beta: float = 10.0
     n_epochs: int = 400
-    prior_policy: None = None  # uniform; Replicas asks for it
-    fit, iterate = run_to_end, epochs
+    prior_policy: None = None  # uniform
 
     def init(self, n_states, n_actions):
-        return SweepState(0, 0, 0.0, torch.zeros(n_states).double(), torch.zeros(n_states, n_actions).double())
+        nothing = torch.zeros(n_states, n_actions, dtype=torch.float64)
+        return SweepState(0, 0, 0.0, nothing[:, 0], nothing, self.beta)
 
     def prepare(self, transitions, n_states, n_actions):
         return erl_torch.empirical_mdp(transitions, n_states, n_actions)
@@ -39,14 +47,14 @@ class SoftValueIteration:
         backed_up = (self.beta * q).exp().mean(1).log() / self.beta  # TV of docs/theory.md
         theta = float(state.value[0] - backed_up[0])
         value = (state.value + backed_up + theta) / 2  # lazy: no period can catch it
-        return SweepState(state.epoch + 1, int(model.visits.sum()), theta, value, q)
+        return SweepState(state.epoch + 1, state.n_tuples + int(model.visits.sum()), theta, value, q, self.beta)
 
     def finished(self, state):
         return state.epoch == self.n_epochs
 
     def solution(self, state, history=(), failure=None):
         prior = torch.ones_like(state.q).softmax(1)
-        end = dict(n_steps=state.n_tuples, status=erl_torch.Status.COMPLETED)
+        end = dict(n_steps=state.n_tuples, status=self.ended(state, failure))
         return erl_torch.Solution.of_action_values(state.q, prior, self.beta, state.theta, **end)
 
 

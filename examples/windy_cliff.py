@@ -1,13 +1,12 @@
 """Learn the windy cliff from random experience, and prove how good the policy is."""
 
-import gymnasium as gym
-
 import erl_torch
+from erl_torch.envs.windy_cliff import WindyCliffEnv
 
 BETA = 10.0
 
-env = gym.make("erl_torch/WindyCliff-v0", render_mode="ansi")
-mdp = env.unwrapped.mdp
+env = WindyCliffEnv(render_mode="ansi")
+mdp = env.mdp
 tuples = erl_torch.collect(env, n_episodes=500, episode_length=1000, seed=0)  # of the uniform prior
 print(f"{len(tuples):,} tuples of the uniform policy")
 
@@ -23,6 +22,6 @@ arrows = "".join(
     "<v>^"[int(row.argmax())] if (row > 0.3).sum() == 1 else "#" for row in learnt.policy
 )  # 0..3: left, down, right, up
 for row in range(5):
-    tiles = env.unwrapped.grid.tiles[3 * row : 3 * row + 3]
+    tiles = env.grid.tiles[3 * row : 3 * row + 3]
     shown = [tile if tile in "HG" else arrow for tile, arrow in zip(tiles, arrows[3 * row :], strict=False)]
     print("  " + " ".join(shown))

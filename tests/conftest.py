@@ -1,12 +1,20 @@
-"""Fixtures of all test files, and Hypothesis' settings."""
+"""Fixtures of all test files, marks, Hypothesis' settings, and a kernel cache for each worker of pytest-xdist."""
 
+import os
 import runpy
 import sys
+from pathlib import Path
+
+if worker := os.environ.get("PYTEST_XDIST_WORKER"):
+    # Before Numba is imported. Two processes that compile two signatures of one kernel at once may give both files the
+    # same name; so each worker has a cache, kept from run to run.
+    caches = os.environ.get("NUMBA_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "numba"))
+    os.environ["NUMBA_CACHE_DIR"] = os.path.join(caches, worker)
 
 import hypothesis
 import numpy as np
 import pytest
-from helpers import DATA, ROOT
+from helpers import DATA, ROOT, processes
 
 from erl_torch import Transitions
 
@@ -17,6 +25,29 @@ hypothesis.settings.register_profile(
     "unshrunk", deadline=None, derandomize=True, phases=(hypothesis.Phase.explicit, hypothesis.Phase.generate)
 )
 hypothesis.settings.load_profile("erl_torch")
+
+
+def pytest_collection_modifyitems(items):
+    """``command``: starts processes, as its fixtures tell. ``fast``: neither that nor ``slow``, which is written."""
+    for item in items:
+        if {"start", "start_for_all"} & set(item.fixturenames):
+            item.add_marker("command")
+        elif item.get_closest_marker("slow") is None:
+            item.add_marker("fast")
+
+
+@pytest.fixture
+def start():
+    """Starts a process, as ``helpers.processes`` has it."""
+    with processes() as start:
+        yield start
+
+
+@pytest.fixture(scope="module")
+def start_for_all():
+    """``start`` for the fixtures of a whole file."""
+    with processes() as start:
+        yield start
 
 
 @pytest.fixture(scope="session")

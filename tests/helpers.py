@@ -1,10 +1,13 @@
 """What several test files need: problems, composed configurations, run directories read back."""
 
+import contextlib
 import os
 import re
+import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -110,6 +113,29 @@ def undocumented(directory: Path) -> set[str]:
 
 
 # -- processes ------------------------------------------------------------------------------------------------
+
+Start = Callable[..., subprocess.Popen[str]]
+
+
+@contextlib.contextmanager
+def processes() -> Iterator[Start]:
+    """``start(*command, **options of Popen)``; its output is captured. What still runs at the end is killed."""
+    with contextlib.ExitStack() as stack:
+
+        def start(*command: object, **options: Any) -> subprocess.Popen[str]:
+            captured: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+            process = subprocess.Popen([str(word) for word in command], text=True, **captured | options)
+            stack.enter_context(process)  # closes its pipes and waits
+            stack.callback(process.kill)
+            return process
+
+        yield start
+
+
+def ended(process: subprocess.Popen[str]) -> tuple[int, str, str]:
+    """Wait for it: (exit code, stdout, stderr)."""
+    out, err = process.communicate(timeout=PATIENCE)
+    return process.returncode, out, err
 
 
 def wait_until(condition: Callable[[], object], what: str) -> None:

@@ -547,8 +547,8 @@ def deterministic(rng: np.random.Generator) -> Given:
 def corridor(rng: np.random.Generator) -> Given:
     n = int(rng.integers(5, 15) if rng.random() < 0.8 else rng.integers(15, 61))
     given = _plain(rng, n)
-    p = np.zeros(given.transition.shape)
-    a = p.shape[1]
+    a = given.reward.shape[1]
+    p = np.zeros((n, a, n))
     weight = rng.uniform(0.02, 1, (a, 3))  # back, rest, on; a drift against the reward makes the far end rare
     for s in range(n):
         for j, to in enumerate((max(s - 1, 0), s, min(s + 1, n - 1))):

@@ -1,6 +1,7 @@
 """The baselines of Algorithm S1 against their equations: slow twins, exact solvers, the optimistic eigenproblem."""
 
 import math
+from typing import Any
 
 import hypothesis
 import numpy as np
@@ -120,6 +121,7 @@ def test_compiled_is_the_slow_twin(problem, learner_class, beta, power):
 def test_read_out_of_z_learning_is_the_mean_over_visits():
     rng = np.random.default_rng(3)
     mdp, once = even_mdp(rng)
+    state: Any
     *_, state = ZLearning(beta=2.0, n_epochs=2).iterate(once, mdp.n_states, mdp.n_actions)
     z, p = np.exp(2.0 * state.value.numpy()), mdp.transition.toarray()
     u = np.exp(2.0 * (mdp.reward - state.rate)) * (p @ z).reshape(mdp.reward.shape)
@@ -344,6 +346,7 @@ def test_a_solution_of_a_discounted_learner_has_no_theta(tmp_path, cliff):
         found.value_functions(n_steps=5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(name for name, learner in LEARNERS.items() if hasattr(learner, "fit")))
 def test_learners_share_one_interface(cliff, name):
     _, data = cliff

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import hypothesis
 import numpy as np
@@ -31,6 +32,7 @@ def all_tuples(mdp):
 # -- the authors' script --------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
 def test_gives_what_the_authors_script_gives(authors, authors_tuples, implementation):
     learner = AlgorithmS1(
@@ -478,7 +480,7 @@ def test_million_tuple_drift_stays_in_range():
     assert solution.u.item() == 1.0
 
 
-BAD = {
+BAD: dict[str, Any] = {
     "beta": [0.0, -1.0, math.nan, math.inf, 1e4, 1e-300],
     "lr_u": [0.0, 1.5, math.nan],
     "lr_rho": [0.0, -0.1, math.inf],

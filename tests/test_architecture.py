@@ -2,12 +2,12 @@
 
 import ast
 import re
-import subprocess
 import sys
 import zlib
 from pathlib import Path
 
 import pytest
+from helpers import ended
 
 ROOT = Path(__file__).parents[1] / "erl_torch"
 # From the ground up; a folder may import from those on lines above its own.
@@ -128,6 +128,6 @@ def test_copies_of_kernels_are_copies():
 
 
 @pytest.mark.parametrize("name", ["TabularMDP", "Transitions", "collect", "evaluate", "tabular_mdp"])
-def test_names_that_need_no_torch_do_not_load_it(name):
+def test_names_that_need_no_torch_do_not_load_it(start, name):
     code = f"import sys, erl_torch; erl_torch.{name}; assert 'torch' not in sys.modules"
-    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT.parent).returncode == 0
+    assert ended(start(sys.executable, "-c", code, cwd=ROOT.parent))[0] == 0

@@ -1,19 +1,14 @@
 """What TensorBoard shows: every tag documented, lines and boards, and its own API over real runs."""
 
-import contextlib
 import json
 import re
-import socket
-import subprocess
 import sys
-import tempfile
-import time
 import urllib.request
 from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import composed, events, undocumented
+from helpers import PATIENCE, composed, events, undocumented, wait_until
 from omegaconf import OmegaConf
 from tensorboard.plugins.hparams import plugin_data_pb2
 
@@ -24,6 +19,7 @@ from erl_torch.run.report import where
 from erl_torch.run.training import train
 from erl_torch.solvers import certify
 
+pytestmark = pytest.mark.slow  # whole runs
 SMALL = ("experience.n_episodes=20", "learner.n_epochs=2")
 
 
@@ -164,81 +160,75 @@ def test_failed_runs_are_marked(tmp_path):
 # -- TensorBoard's own API -----------------------------------------------------------------------------------
 
 
-@contextlib.contextmanager
-def tensorboard(logdir, n_runs):
-    """Asks the API of a TensorBoard on loopback that has read ``n_runs`` runs."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+@pytest.fixture
+def tensorboard(tmp_path, start):
+    """``tensorboard(logdir, n_runs)``: asks the API of one, on a port of its choice, once it has read so many runs."""
 
-    def ask(path, body=None):
-        data = None if body is None else json.dumps(body).encode()
-        request = urllib.request.Request(
-            f"http://127.0.0.1:{port}/data/{path}", data, {"Content-Type": "application/json"}
-        )
-        with urllib.request.urlopen(request, timeout=20) as answer:
-            return json.load(answer)
+    def serve(logdir, n_runs):
+        arguments = ["--logdir", logdir, "--host", "127.0.0.1", "--port", 0, "--load_fast", "false"]
+        printed = tmp_path / "printed"
+        with printed.open("w") as log:
+            command = [sys.executable, "-W", "ignore", "-m", "tensorboard.main", *arguments]
+            process = start(*command, stdout=log, stderr=log)
 
-    arguments = ["--logdir", str(logdir), "--host", "127.0.0.1", "--port", str(port), "--load_fast", "false"]
-    with tempfile.TemporaryFile() as log:
-        process = subprocess.Popen(
-            [sys.executable, "-W", "ignore", "-m", "tensorboard.main", *arguments], stdout=log, stderr=log
-        )
-        try:
-            deadline = time.monotonic() + 60
-            while True:
-                with contextlib.suppress(OSError):
-                    if len(ask("runs")) == n_runs:
-                        break
-                assert process.poll() is None
-                assert time.monotonic() < deadline
-                time.sleep(0.1)
-            yield ask
-        finally:
-            process.terminate()
-            process.wait(20)
+        def address():
+            assert process.poll() is None, printed.read_text()
+            return re.search(r"http://127\.0\.0\.1:\d+", printed.read_text())
+
+        def ask(path, body=None):
+            data = None if body is None else json.dumps(body).encode()
+            headers = {"Content-Type": "application/json"}
+            request = urllib.request.Request(f"{address()[0]}/data/{path}", data, headers)
+            with urllib.request.urlopen(request, timeout=PATIENCE) as answer:
+                return json.load(answer)
+
+        wait_until(address, "TensorBoard")
+        wait_until(lambda: len(ask("runs")) == n_runs, "its reading")
+        return ask
+
+    return serve
 
 
-def test_api_has_tags_boards_and_columns(runs):
+def test_api_has_tags_boards_and_columns(runs, tensorboard):
     root, kinds = runs
-    with tensorboard(root, len(kinds)) as ask:
-        tags = {run: set(found) for run, found in ask("plugin/scalars/tags").items()}
-        assert tags == {name: set(events(root / name).Tags()["scalars"]) for name in kinds}
-        last = ask("plugin/scalars/scalars?run=s1&tag=s1/theta")[-1]
-        assert last[1:] == [kinds["s1"]["n_tuples"], pytest.approx(kinds["s1"]["theta"], rel=1e-6)]
+    ask = tensorboard(root, len(kinds))
+    tags = {run: set(found) for run, found in ask("plugin/scalars/tags").items()}
+    assert tags == {name: set(events(root / name).Tags()["scalars"]) for name in kinds}
+    last = ask("plugin/scalars/scalars?run=s1&tag=s1/theta")[-1]
+    assert last[1:] == [kinds["s1"]["n_tuples"], pytest.approx(kinds["s1"]["theta"], rel=1e-6)]
 
-        boards = {category["title"]: category["chart"] for category in ask("plugin/custom_scalars/layout")["category"]}
-        assert list(boards) == [board.CONVERGENCE, board.BIAS, board.RETURNS]
-        titles = {chart["title"] for charts in boards.values() for chart in charts}
-        assert {title for charts in board.LINES.values() for title in charts} <= titles
-        written = set().union(*tags.values())
-        for chart in (chart for charts in boards.values() for chart in charts):
-            for band in chart.get("margin", {}).get("series", []):
-                assert set(band.values()) <= written
-            for pattern in chart.get("multiline", {}).get("tag", []):
-                assert any(re.match(pattern, tag) for tag in written), pattern
+    boards = {category["title"]: category["chart"] for category in ask("plugin/custom_scalars/layout")["category"]}
+    assert list(boards) == [board.CONVERGENCE, board.BIAS, board.RETURNS]
+    titles = {chart["title"] for charts in boards.values() for chart in charts}
+    assert {title for charts in board.LINES.values() for title in charts} <= titles
+    written = set().union(*tags.values())
+    for chart in (chart for charts in boards.values() for chart in charts):
+        for band in chart.get("margin", {}).get("series", []):
+            assert set(band.values()) <= written
+        for pattern in chart.get("multiline", {}).get("tag", []):
+            assert any(re.match(pattern, tag) for tag in written), pattern
 
-        found = ask("plugin/hparams/experiment", {"includeMetrics": True})
-        columns = {column["name"] for column in found["hparamInfos"]}
-        union = set().union(*(board.hyperparameters(composed(*o)) for o in ((), ("learner=s1_efficient",))))
-        assert union | {"discount", "method", "n_replicas", "n_experience"} <= columns
-        metrics = [metric["name"]["tag"] for metric in found["metricInfos"]]
-        first = ["Final/gap", "Final/objective", "Final/return", "Final/reward_per_step", "Final/theta"]
-        assert metrics[:5] == first  # those that its table shows at first
-        rows = ask(
-            "plugin/hparams/session_groups",
-            {
-                "startIndex": 0, "sliceSize": 100, "allowedStatuses": ["STATUS_SUCCESS"],
-                "colParams": [{"metric": {"tag": tag}} for tag in first] + [{"hparam": "learner"}],
-            },
-        )["sessionGroups"]  # fmt: skip
-        assert {row["sessions"][0]["name"]: row["hparams"]["learner"] for row in rows} == {
-            "s1": "s1", "efficient": "s1_efficient", "soft_q": "soft_q", "exact": "exact", "replicas": "s1",
-        }  # fmt: skip
-        objective = {
-            row["sessions"][0]["name"]: value["value"]
-            for row in rows
-            for value in row["metricValues"]
-            if value["name"]["tag"] == "Final/objective"
-        }
-        np.testing.assert_allclose([objective[n] for n in kinds], [kinds[n]["objective"] for n in kinds], rtol=1e-6)
+    found = ask("plugin/hparams/experiment", {"includeMetrics": True})
+    columns = {column["name"] for column in found["hparamInfos"]}
+    union = set().union(*(board.hyperparameters(composed(*o)) for o in ((), ("learner=s1_efficient",))))
+    assert union | {"discount", "method", "n_replicas", "n_experience"} <= columns
+    metrics = [metric["name"]["tag"] for metric in found["metricInfos"]]
+    first = ["Final/gap", "Final/objective", "Final/return", "Final/reward_per_step", "Final/theta"]
+    assert metrics[:5] == first  # those that its table shows at first
+    rows = ask(
+        "plugin/hparams/session_groups",
+        {
+            "startIndex": 0, "sliceSize": 100, "allowedStatuses": ["STATUS_SUCCESS"],
+            "colParams": [{"metric": {"tag": tag}} for tag in first] + [{"hparam": "learner"}],
+        },
+    )["sessionGroups"]  # fmt: skip
+    assert {row["sessions"][0]["name"]: row["hparams"]["learner"] for row in rows} == {
+        "s1": "s1", "efficient": "s1_efficient", "soft_q": "soft_q", "exact": "exact", "replicas": "s1",
+    }  # fmt: skip
+    objective = {
+        row["sessions"][0]["name"]: value["value"]
+        for row in rows
+        for value in row["metricValues"]
+        if value["name"]["tag"] == "Final/objective"
+    }
+    np.testing.assert_allclose([objective[n] for n in kinds], [kinds[n]["objective"] for n in kinds], rtol=1e-6)

@@ -28,6 +28,7 @@ def digits():
         yield
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", range(len(KINDS)), ids=lambda kind: KINDS[kind].__name__)
 def test_nothing_that_is_called_proven_is_wrong(kind, monkeypatch):
     """Both solvers, ``certify`` of five policies, and three routes to the objective."""

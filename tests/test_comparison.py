@@ -132,6 +132,7 @@ def test_every_learner_has_the_same_experience(problem):
     assert found.status["s1"] == [["completed"] * 2] * 2
 
 
+@pytest.mark.slow
 def test_processes_change_nothing(problem):
     mdp, prior = problem
     one, two = (compare(mdp, learners(prior), 2, 500, 2, None, prior, processes=n) for n in (1, 2))
@@ -202,7 +203,7 @@ def test_run_directory(finished):
 
 
 def test_experience_is_that_of_train(finished):
-    from erl_torch.experience.collect import known_mdp
+    from erl_torch.mdp.from_gymnasium import known_mdp
     from erl_torch.run.build import make_env
 
     mdp = known_mdp(make_env(composed().env))

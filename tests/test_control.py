@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -68,6 +69,7 @@ def cell_of(task, bins, state):
     return np.ravel_multi_index([np.digitize(v, e) for v, e in zip(x, edges, strict=True)], bins.bins, order="F")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CONTROL_TASKS)
 def test_steps_are_gymnasiums(name):
     """10,000 states on and beyond the binned box."""
@@ -95,7 +97,7 @@ def test_steps_are_gymnasiums(name):
 def test_first_states_are_gymnasiums(name):
     """Two-sample Kolmogorov-Smirnov on every coordinate, p > 1e-4; cells with the exact probabilities."""
     task = control_task(name)
-    env = gym.make(task.gymnasium_id).unwrapped
+    env: Any = gym.make(task.gymnasium_id).unwrapped
     theirs = []
     for seed in range(500):
         env.reset(seed=seed)
@@ -149,6 +151,7 @@ def equal(one, other):
     return one.reward_shift == other.reward_shift and all(np.array_equal(a, b) for a, b in pairs)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CONTROL_TASKS)
 def test_model_does_not_depend_on_the_workers(name):
     n_samples = 40_000 // SMALL[name] ** 2  # several chunks
@@ -251,6 +254,7 @@ def test_works_without_a_cache_folder(tmp_path, monkeypatch):
     assert estimate.cache_folder() == tmp_path / "erl_torch"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "theta", "deviation", "seeds"),
     [("pendulum", 3.338, 0.095, 20), ("mountain_car", 0.0400, 0.0067, 20), ("cart_pole", 0.1660, 0.0017, 3)],
@@ -290,7 +294,7 @@ def test_deterministic_rollouts_are_gymnasiums_episodes(name, steps):
     task, n = control_task(name), 20
     policy = some_policy(task, np.random.default_rng(5))
     played = rollout(name, policy, n, steps, np.random.default_rng(6))
-    env = gym.make(next(i for i in IDS if CONTROL_TASKS[name] in i)).unwrapped
+    env: Any = gym.make(next(i for i in IDS if CONTROL_TASKS[name] in i)).unwrapped
     first = task.initial(n, np.random.default_rng(6)).numpy()
     for i in range(n):
         cell, _ = env.reset(seed=0)
@@ -383,8 +387,8 @@ def test_collected_stream(on_prior):
         assert abs(column.mean() - p) < 4 * math.sqrt(p * (1 - p) / len(data))
     again = collect_rollouts("cart_pole", 1500, 15, 3, **settings)
     other = collect_rollouts("cart_pole", 1500, 15, 4, **settings)
-    for column in ("s", "a", "r", "s_next", "a_next"):
-        assert np.array_equal(getattr(data, column), getattr(again, column))
+    for name in ("s", "a", "r", "s_next", "a_next"):
+        assert np.array_equal(getattr(data, name), getattr(again, name))
     assert not np.array_equal(data.s[:500], other.s[:500])
 
 
@@ -404,7 +408,7 @@ def test_collected_stream_against_stepping():
 @pytest.mark.parametrize("env_id", IDS)
 def test_environments_pass_gymnasiums_check(env_id):
     check_env(gym.make(env_id).unwrapped, skip_render_check=True)
-    env = gym.make(env_id, render_mode="rgb_array")
+    env: Any = gym.make(env_id, render_mode="rgb_array")
     env.reset(seed=0)
     first = env.render()
     for t in range(10):
@@ -422,7 +426,7 @@ def test_environments_pass_gymnasiums_check(env_id):
 @pytest.mark.parametrize("env_id", IDS)
 def test_same_seed_same_episode_to_the_time_limit(env_id):
     def episode():
-        env = gym.make(env_id)
+        env: Any = gym.make(env_id)
         cells, ends = [env.reset(seed=7)[0]], (False, False)
         while not any(ends):
             cell, _, *ends, _ = env.step(len(cells) // 3 % env.action_space.n)
@@ -437,8 +441,8 @@ def test_same_seed_same_episode_to_the_time_limit(env_id):
 
 
 def test_torques_reach_the_original():
-    acrobot = gym.make("erl_torch/DiscreteAcrobot-v0", torques=[-3, 4], bins=5).unwrapped
-    pendulum = gym.make("erl_torch/DiscretePendulum-v0", torques=[1.5], bins=[4, 3], low=[-1, -8]).unwrapped
+    acrobot: Any = gym.make("erl_torch/DiscreteAcrobot-v0", torques=[-3, 4], bins=5).unwrapped
+    pendulum: Any = gym.make("erl_torch/DiscretePendulum-v0", torques=[1.5], bins=[4, 3], low=[-1, -8]).unwrapped
     assert acrobot.observation_space.n == 625
     assert pendulum.observation_space.n == 12
     for env, action, torque in ((acrobot, 1, 4.0), (acrobot, 0, -3.0), (pendulum, 0, 1.5)):

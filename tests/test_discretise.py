@@ -1,12 +1,14 @@
 """Uniform bins, and environments with Box observations made Discrete."""
 
 import warnings
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
+from gymnasium.utils.passive_env_checker import env_reset_passive_checker, env_step_passive_checker
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -130,12 +132,11 @@ BOX = gym.spaces.Box(-1, 1, (2,))
 
 
 def test_bins_of_the_spaces_own_bounds():
-    env = Discretise(gym.make("MountainCar-v0"), [12, 6])
+    env: Any = Discretise(gym.make("MountainCar-v0"), [12, 6])
     assert env.observation_space == gym.spaces.Discrete(72)
     assert env.action_space == gym.spaces.Discrete(3)
-    space = UniformBins(
-        (12, 6), tuple(map(float, np.float32([-1.2, -0.07]))), tuple(map(float, np.float32([0.6, 0.07])))
-    )
+    low, high = (tuple(np.array(ends, np.float32).tolist()) for ends in ([-1.2, -0.07], [0.6, 0.07]))
+    space = UniformBins((12, 6), low, high)
     state, _ = env.reset(seed=0)
     for t in range(150):
         assert type(state) is np.int64
@@ -145,7 +146,7 @@ def test_bins_of_the_spaces_own_bounds():
 
 
 def test_box_actions():
-    env = Discretise(Fixed(BOX, BOX), 4, actions=3)
+    env: Any = Discretise(Fixed(BOX, BOX), 4, actions=3)
     assert env.action_space.n == 9
     env.reset(seed=0)
     seen = []
@@ -162,14 +163,14 @@ def test_box_actions():
 
 
 def test_discrete_actions_keep_their_numbers():
-    env = Discretise(Fixed(BOX, gym.spaces.Discrete(3, start=5), np.zeros(2)), 4)
+    env: Any = Discretise(Fixed(BOX, gym.spaces.Discrete(3, start=5), np.zeros(2)), 4)
     env.reset(seed=0)
     env.step(2)
     assert env.unwrapped.action == 7
 
 
 def test_features_and_nan():
-    env = Discretise(Fixed(BOX, BOX), 4, [0.0], [2.0], actions=3, features=lambda x: np.hypot(*x)[None])
+    env: Any = Discretise(Fixed(BOX, BOX), 4, [0.0], [2.0], actions=3, features=lambda x: np.hypot(*x)[None])
     env.reset(seed=0)
     assert env.observation_space.n == 4
     assert env.step(4)[0] == 0
@@ -185,8 +186,8 @@ def test_gymnasiums_check_sees_only_that_it_is_a_wrapper():
         warnings.simplefilter("always")
         env = gym.make("Pendulum-v1").unwrapped
         wrapped = Discretise(env, 5, actions=3)
-        gym.utils.env_checker.env_reset_passive_checker(wrapped)
-        gym.utils.env_checker.env_step_passive_checker(wrapped, 1)
+        env_reset_passive_checker(wrapped)
+        env_step_passive_checker(wrapped, 1)  # type: ignore[misc]  # its own type of actions
     assert not caught
 
     class Unwrapped(gym.Env):  # check_env wants an environment that is not a wrapper

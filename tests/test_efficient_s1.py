@@ -48,6 +48,7 @@ def with_noise(data, rng, scale=1.0):
 # -- off: the paper ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @hypothesis.settings(max_examples=30)
 @hypothesis.given(
     problem=problems(),
@@ -92,6 +93,7 @@ def test_a_psi_phase_cut_short_is_remembered(authors_tuples):
 # -- the compiled loops and their twins -------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @hypothesis.settings(max_examples=40)
 @hypothesis.given(
     problem=problems(),
@@ -140,6 +142,7 @@ def test_kernels_agree_with_the_direct_form(problem, beta, expected, noisy, aver
             np.testing.assert_allclose(back(sums) / back(z).max(), total.ravel() / direct.max(), rtol=1e-11)
 
 
+@pytest.mark.slow
 @hypothesis.settings(max_examples=30)
 @hypothesis.given(problem=problems(), beta=st.floats(0.1, 5.0))
 def test_a_phase_of_the_online_mode_agrees_with_its_direct_form(problem, beta):
@@ -199,6 +202,7 @@ def test_reaches_certainty_equivalence(problem, beta, switches, log_domain):
     assert found.theta == pytest.approx(limit.theta, abs=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n_epochs", [3, 15])
 def test_windy_cliff_loses_what_certainty_equivalence_loses(n_epochs):
     exact = solve_soft_bellman(CLIFF, 10.0)
@@ -323,6 +327,7 @@ def test_steps_of_the_clocks():
 # -- never NaN --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @hypothesis.settings(max_examples=120)
 @hypothesis.given(
     problem=problems(),

@@ -1,6 +1,7 @@
 """Contract of every registered environment, and the rules of the grid worlds."""
 
 import warnings
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -62,6 +63,7 @@ def test_rows_sum_to_one_and_every_state_is_a_state(make, env_id):
     assert (mdp.transition.data > 0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env_id", MODELS)
 def test_steps_follow_the_model(make, env_id):
     steps_follow_the_model(make(env_id).unwrapped)
@@ -263,7 +265,8 @@ def test_dynamics_shift_is_figure_4():
     assert returns(late, solved[before]) == pytest.approx(-997.14, abs=0.005)
     assert returns(late, solved[late]) == pytest.approx(-947.14, abs=0.005)
     assert returns(after, solved[after]) == pytest.approx(-946.76, abs=0.005)
-    assert np.array_equal(gym.make("erl_torch/DynamicsShift-v0", shifted=True).unwrapped.mdp.reward, after.mdp().reward)
+    env: Any = gym.make("erl_torch/DynamicsShift-v0", shifted=True).unwrapped
+    assert np.array_equal(env.mdp.reward, after.mdp().reward)
 
 
 def test_wind_moves_before_the_action():

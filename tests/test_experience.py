@@ -1,5 +1,7 @@
 """Streams of tuples: their law, their ends, their seeds."""
 
+from typing import Any
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -206,5 +208,6 @@ def test_vector_environments_must_tell_how_they_reset():
 def test_vector_of_this_packages_environments():
     env = gym.make_vec("erl_torch/WindyCliff-v0", 3, vectorization_mode="sync")
     data = erl_torch.collect(env, 3, 1000, seed=0)
-    p = gym.make("erl_torch/WindyCliff-v0").unwrapped.mdp.transition.toarray()
+    one: Any = gym.make("erl_torch/WindyCliff-v0").unwrapped
+    p = one.mdp.transition.toarray()
     assert (p[data.s * 4 + data.a, data.s_next] > 0).all()

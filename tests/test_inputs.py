@@ -5,6 +5,7 @@ import warnings
 from dataclasses import fields, replace
 from fractions import Fraction
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -73,7 +74,7 @@ def rows():
         lambda: tensor().to_sparse(),
         lambda: tensor(dtype=torch.bfloat16).to_sparse(),
         lambda: tensor().to_sparse(1),
-        lambda: torch.sparse_csr_tensor(*rows(), (2, 2)),
+        lambda: torch.sparse_csr_tensor(*rows(), (2, 2)),  # type: ignore[call-arg]
         lambda: sp.csr_array(TABLE),
         lambda: sp.coo_matrix(TABLE),
         lambda: sp.dia_array(TABLE),
@@ -199,7 +200,7 @@ def below(n):
     return -1 if n is NO_COUNT[0] else n
 
 
-CONTINUOUS = {
+CONTINUOUS: dict[str, Any] = {
     "beta": [
         partial(solve_soft_bellman, MDP),
         partial(solve_biasing, MDP),
@@ -326,7 +327,7 @@ def test_what_has_a_length_but_no_room_is_refused_first():
 
 def test_parts_of_another_kind_are_named():
     with pytest.raises(InputError, match=r"^chunk=.* \(ndarray\): must be Transitions$"):
-        list(EfficientS1().online([DATA, POLICY], 2, 2))
+        list(EfficientS1().online([DATA, POLICY], 2, 2))  # type: ignore[list-item]
     with pytest.raises(InputError, match=r"^n_replicas=.*: must be a whole number >= 1$"):
         Replicas.of(AlgorithmS1(), sp.csr_array(TABLE), beta=[1.0, 2.0])
     with pytest.raises(InputError, match=r"^learners=3 \(int\): must be a list$"):

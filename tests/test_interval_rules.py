@@ -27,8 +27,8 @@ def spread(n, variance=1.0):
 
 def walk(*rows):
     """Counts of rows (how often, s, a, r, s')."""
-    n, s, a, r, s_next = zip(*rows, strict=True)
-    s, a, r, s_next = (np.repeat(column, n) for column in (s, a, r, s_next))
+    n, *columns = zip(*rows, strict=True)
+    s, a, r, s_next = (np.repeat(column, n) for column in columns)
     return empirical_mdp(Transitions(s, a, r, s_next, a), int(s.max()) + 1, int(a.max()) + 1)
 
 

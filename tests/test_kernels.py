@@ -1,7 +1,9 @@
 """Kernels alone, where what calls them would not show a mistake: edges, extremes, chains counted by hand."""
 
 import math
+from itertools import product
 
+import numba
 import numpy as np
 import pytest
 
@@ -12,6 +14,7 @@ from erl_torch.evaluation import Judge
 from erl_torch.experience import kernels as experience_kernels
 from erl_torch.experience.sampling import _levels, _words, policy_cdf, sampling_tables
 from erl_torch.learners.efficient_s1 import kernels as efficient_s1_kernels
+from erl_torch.learners.s1 import kernels as s1_kernels
 from erl_torch.solvers.policy import reward_per_step
 
 BELOW_1 = math.nextafter(1.0, 0.0)
@@ -34,6 +37,49 @@ def test_uniforms_are_numpys_to_the_last_bit():
     experience_kernels._uniforms(state, out[:200], 200)
     experience_kernels._uniforms(state, out[200:], 300)
     assert np.array_equal(out, np.stack([generator.random(500) for generator in generators], axis=1))
+
+
+def test_a_step_of_pcg64_without_the_compiler_is_numpys():
+    generator = np.random.PCG64(5)
+    state = generator.state["state"]
+    words = [state["state"] >> 64, state["state"] & 2**64 - 1, state["inc"] >> 64, state["inc"] & 2**64 - 1]
+    for expected in generator.random_raw(1000):
+        *words[:2], found = experience_kernels._pcg64_uncompiled(*words)
+        assert found == expected
+
+
+@numba.njit
+def fma(a, b, c):
+    return s1_kernels._fma(a, b, c)
+
+
+EDGES = (
+    0.0,
+    -0.0,
+    1.0,
+    -1.0 - 2**-52,
+    0.1,
+    3.0,
+    2.0**-1074,
+    2.0**-537,
+    -(2.0**-600),
+    1e308,
+    -1e308,
+    math.inf,
+    math.nan,
+)
+
+
+def test_a_multiply_add_without_the_compiler_is_the_compiled_one():
+    """Signs of zeros, numbers below the smallest normal one, overflow; and numbers whose product nearly cancels."""
+    rng = np.random.default_rng(0)
+    cases = list(product(EDGES, repeat=3))
+    for a, b in rng.standard_normal((1000, 2)):
+        cases += [(a, b, -a * b), (a, b, rng.standard_normal()), (a * 2.0**-700, b * 2.0**-350, 2.0**-1060)]
+    with np.errstate(all="ignore"):
+        for case in cases:
+            one, other = s1_kernels._fma_uncompiled(*case), np.float64(fma(*case))
+            assert one.tobytes() == other.tobytes() or (np.isnan(one) and np.isnan(other)), case
 
 
 def test_lanes_draw_from_rows_of_any_length():

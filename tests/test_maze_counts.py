@@ -23,6 +23,7 @@ def one_maze(size, density, wind_level, seed, i):
     return list(random_mazes(i + 1, size, None, density, wind_level, seed))[i].mdp()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("cell", "beta"),
     [
@@ -98,6 +99,7 @@ def test_lu_pattern_holds_the_factors():
 # -- the authors' rule -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("i", range(5))
 def test_counts_of_the_authors(i):
     mdp, known = maze(i)
@@ -137,6 +139,7 @@ def test_power_iteration_is_the_plain_one(tolerance, max_steps):
     np.testing.assert_allclose(chi, expected_chi, rtol=1e-11)
 
 
+@pytest.mark.slow
 def test_a_long_count_is_an_unconverged_eigenvector():
     """12 iterations by the rule, 4 with converged eigenvectors, and 4 by power iterations that may go on."""
     mdp = one_maze(30, 0.25, 4.0, 3, 1)

@@ -90,11 +90,11 @@ def test_wind_follows_its_law():
         angle = smoothed_by_the_rules(np.full((size, size), rng.uniform(0, 2 * np.pi)), noise)
         strength = smoothed_by_the_rules(rng.beta(level, 2, (size, size)), np.zeros((1, size, size)))
         other.append(np.stack([angle, strength]))
-    drawn, other = np.stack(drawn), np.stack(other)
+    fields = np.stack(drawn), np.stack(other)
     for i, j in ((0, 0), (2, 3), (5, 5)):
         for part in range(2):
-            assert stats.ks_2samp(drawn[:, part, i, j], other[:, part, i, j]).pvalue > 1e-3
-    neighbours = [wind[:, 0, 2, 3] - wind[:, 0, 2, 2] for wind in (drawn, other)]
+            assert stats.ks_2samp(*(field[:, part, i, j] for field in fields)).pvalue > 1e-3
+    neighbours = [wind[:, 0, 2, 3] - wind[:, 0, 2, 2] for wind in fields]
     assert stats.ks_2samp(*neighbours).pvalue > 1e-3
 
 

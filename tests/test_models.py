@@ -1,6 +1,7 @@
 """Models read from Gymnasium's tables, with both readings of an episode's end."""
 
 import warnings
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -34,7 +35,7 @@ class Table(gym.Env):
 
 @pytest.mark.parametrize("env_id", TOYS)
 def test_restart_against_a_loop_over_P(env_id):
-    env = gym.make(env_id)
+    env: Any = gym.make(env_id)
     mdp = quiet(env)
     start = env.unwrapped.initial_state_distrib
     p = np.zeros((mdp.n_states, mdp.n_actions, mdp.n_states))
@@ -52,7 +53,7 @@ def test_restart_against_a_loop_over_P(env_id):
 @pytest.mark.parametrize("env_id", TOYS)
 def test_restart_has_the_law_of_episodes(env_id):
     """Model and env.step agree: mean reward and the share of each state in a stream, under the prior (fixed seed)."""
-    env = gym.make(env_id)
+    env: Any = gym.make(env_id)
     model = erl_torch.collect(quiet(env), 400, 100, seed=0)
     steps = erl_torch.collect(env, 400, 100, seed=1)
     n = env.observation_space.n
@@ -142,10 +143,10 @@ def test_environments_without_a_table_are_refused():
 
 
 def test_a_wrapper_that_changes_the_process_hides_the_model():
-    env = gym.make("erl_torch/WindyCliff-v0")
+    env: Any = gym.make("erl_torch/WindyCliff-v0")
     assert known_mdp(env) is env.unwrapped.mdp
     assert known_mdp(gym.wrappers.RecordEpisodeStatistics(env)) is env.unwrapped.mdp
-    doubled = gym.wrappers.TransformReward(env, lambda r: 2 * r)
+    doubled = gym.wrappers.TransformReward(env, lambda r: 2 * float(r))
     assert known_mdp(doubled) is None
     assert set(erl_torch.collect(doubled, 1, 200).r) == {-10.0, -2.0}  # stepped through, so what the user wrapped
 

@@ -4,11 +4,10 @@ import contextlib
 import io
 import json
 import os
-import subprocess
 import sys
 
 import pytest
-from helpers import ROOT, events
+from helpers import ROOT, ended, events
 
 from erl_torch.output import Lasting
 
@@ -66,26 +65,24 @@ def test_lost_output_is_sent_nowhere_and_named_once(monkeypatch, capfd):
     assert capfd.readouterr().err.count("warning: standard output is lost (No space left on device)") == 1
 
 
-def test_runs_end_well_without_their_output(tmp_path):
+def test_runs_end_well_without_their_output(tmp_path, start):
     """On a full device, with a reader that is gone, with closed descriptors, and a sweep."""
     train = [sys.executable, str(ROOT / "train.py"), *SMALL]
-    end, start = os.pipe()
+    end, broken = os.pipe()
     os.close(end)
     with contextlib.ExitStack() as stack:
         full = stack.enter_context(open("/dev/full", "w"))
         processes = {
-            "full": subprocess.Popen([*train, "hydra.run.dir=full"], cwd=tmp_path, stdout=full, stderr=start),
-            "closed": subprocess.Popen(
-                ["sh", "-c", '"$@" hydra.run.dir=closed 0<&- >&- 2>&-', "sh", *train], cwd=tmp_path
+            "full": start(*train, "hydra.run.dir=full", cwd=tmp_path, stdout=full, stderr=broken),
+            "closed": start("sh", "-c", '"$@" hydra.run.dir=closed 0<&- >&- 2>&-', "sh", *train, cwd=tmp_path),
+            "sweep": start(
+                *train[:2], "-m", *SMALL, "seed=0", "hydra.sweep.dir=sweep", "hydra.sweep.subdir=job",
+                cwd=tmp_path, stdout=broken, stderr=full,
             ),
-            "sweep": subprocess.Popen(
-                [*train[:2], "-m", *SMALL, "seed=0", "hydra.sweep.dir=sweep", "hydra.sweep.subdir=job"],
-                cwd=tmp_path, stdout=start, stderr=full,
-            ),
-            "bad": subprocess.Popen([*train, "learner.beta=0"], cwd=tmp_path, stdout=full, stderr=start),
+            "bad": start(*train, "learner.beta=0", cwd=tmp_path, stdout=full, stderr=broken),
         }  # fmt: skip
-        os.close(start)
-        codes = {name: process.wait(timeout=120) for name, process in processes.items()}
+        os.close(broken)
+        codes = {name: ended(process)[0] for name, process in processes.items()}
     assert codes == {"full": 0, "closed": 0, "sweep": 0, "bad": 1}
     for directory in (tmp_path / "full", tmp_path / "closed", tmp_path / "sweep" / "job"):
         assert json.loads((directory / "result.json").read_text())["status"] == "completed"

@@ -2,16 +2,16 @@
 
 import contextlib
 import shutil
-import subprocess
 import sys
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from helpers import ROOT, composed
+from helpers import ROOT, composed, ended
 from omegaconf import OmegaConf
 from PIL import Image
 
@@ -52,7 +52,8 @@ def cliff(tmp_path_factory):
 
 def test_returns_are_those_of_the_model(cliff, capsys):
     played = play(arguments(f"run={cliff}", "n_episodes=200", "render=none"))
-    mdp = make_env(composed().env).unwrapped.mdp
+    env: Any = make_env(composed().env).unwrapped
+    mdp = env.mdp
     expected = 200 * reward_per_step(mdp, Solution.load(cliff / "solution.npz").policy.numpy(), 200)
     error = played.returns.std() / np.sqrt(200)
     assert abs(played.returns.mean() - expected) < 4.5 * error
@@ -86,10 +87,10 @@ def test_gif(cliff, capsys):
     assert str(path) in capsys.readouterr().out
     with Image.open(path) as picture:
         # Equal pictures in a row become one that stays longer.
-        assert 1 < picture.n_frames <= len(played.shown) == 6
+        assert 1 < picture.n_frames <= len(played.shown) == 6  # type: ignore[attr-defined]  # of gifs
         assert picture.size == played.shown[0].shape[1::-1]
         total = 0
-        for frame in range(picture.n_frames):
+        for frame in range(picture.n_frames):  # type: ignore[attr-defined]
             picture.seek(frame)
             total += picture.info["duration"]
         assert total == 6 * 250  # four steps a second
@@ -109,6 +110,7 @@ def test_greedy_takes_the_most_probable_action(cliff, tmp_path):
         play(arguments(f"run={run}", "render=gif"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("env", "n_states", "n_actions", "render"),
     [
@@ -125,7 +127,7 @@ def test_greedy_takes_the_most_probable_action(cliff, tmp_path):
 def test_environments(cliff, tmp_path, capsys, env, n_states, n_actions, render):
     cfg = composed(f"env={env}")
     if n_states is None:
-        spaces = make_env(cfg.env)
+        spaces: Any = make_env(cfg.env)
         n_states, n_actions = spaces.observation_space.n, spaces.action_space.n
     run = copy(cliff, tmp_path / "run", np.full((n_states, n_actions), 1 / n_actions), f"env={env}")
     played = play(arguments(f"run={run}", "n_episodes=1", f"render={render}", "n_steps=2"))
@@ -139,6 +141,7 @@ def test_environments(cliff, tmp_path, capsys, env, n_states, n_actions, render)
         assert played.ended.all()
 
 
+@pytest.mark.slow
 def test_latest_and_replicas(cliff, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError, match="run=latest: must be a run directory: there is no run below runs/"):
@@ -179,19 +182,19 @@ def test_bad_runs_get_one_line(cliff, tmp_path):
     for i, (text, expected) in enumerate(
         [
             (None, "No such file"),
-            ("env: [", "while parsing"),
-            ("- 3", "config.yaml ("),
-            ("seed: 0", "Missing key env"),
-            ("env: {name: x}\nlearner: {name: s1}\nevaluation: {horizon: 1}", "Missing key id"),
+            (b"env: [", "while parsing"),
+            (b"- 3", "config.yaml ("),
+            (b"seed: 0", "Missing key env"),
+            (b"env: {name: x}\nlearner: {name: s1}\nevaluation: {horizon: 1}", "Missing key id"),
             (b"\xff\xfe\xfa", "config.yaml ("),
-            ("a: ${b}", "config.yaml ("),
+            (b"a: ${b}", "config.yaml ("),
         ]
     ):
         run = tmp_path / str(i)
         shutil.copytree(cliff, run)
         (run / ".hydra" / "config.yaml").unlink()
         if text is not None:
-            (run / ".hydra" / "config.yaml").write_bytes(text if isinstance(text, bytes) else text.encode())
+            (run / ".hydra" / "config.yaml").write_bytes(text)
         line = complaint(f"run={run}")
         assert line.startswith(f"run={run}: must be a run directory with the configuration")
         assert expected in line
@@ -237,20 +240,14 @@ def test_solutions_with_a_wrong_field_are_refused(cliff, tmp_path, field):
         ReplicaSolution.load(tmp_path / "r.npz")
 
 
-def test_command_line(cliff, tmp_path):
+def test_command_line(cliff, tmp_path, start):
     for overrides, code, out, err in [
         ((f"run={cliff}", "render=none", "n_episodes=2"), 0, "windy_cliff, exact, seed 0", ""),
         (("run=nowhere",), 1, "", "error: run=nowhere: must be a run directory"),
     ]:
-        done = subprocess.run(
-            [sys.executable, str(ROOT / "play.py"), *overrides],
-            cwd=tmp_path,
-            capture_output=True,
-            text=True,
-            timeout=120,
-        )
-        assert done.returncode == code, done.stderr
-        assert done.stdout.startswith(out)
-        assert done.stderr.startswith(err)
-        assert done.stderr.count("\n") == code
+        found = ended(start(sys.executable, ROOT / "play.py", *overrides, cwd=tmp_path))
+        assert found[0] == code, found
+        assert found[1].startswith(out)
+        assert found[2].startswith(err)
+        assert found[2].count("\n") == code
     assert not list(tmp_path.iterdir())  # nothing of its own is left

@@ -3,6 +3,7 @@
 import json
 import tracemalloc
 from dataclasses import replace
+from typing import Any
 
 import hypothesis
 import numpy as np
@@ -81,6 +82,7 @@ def alone(request, small):
     return learner, *([learner.fit(d, 6, 3) for d in streams_] for streams_ in small[1:])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", HOW, ids=lambda how: "-".join(f"{k}={v}" for k, v in how.items()))
 def test_bits_of_replicas_are_those_of_single_runs(small, alone, how):
     (mdp, data, noisy), (learner, plain, varied) = small, alone
@@ -102,7 +104,11 @@ def test_bits_of_replicas_are_those_of_single_runs(small, alone, how):
 def test_bits_on_a_shared_stream(small, how, noisy):
     """A sweep: temperatures and step sizes of their own, one stream."""
     data = small[2 if noisy else 1][1]
-    vectors = {"beta": np.linspace(0.5, 6, 9), "lr_u": np.geomspace(0.001, 0.4, 9), "lr_psi": [0.1, 0.3, 1.0] * 3}
+    vectors: dict[str, Any] = {
+        "beta": np.linspace(0.5, 6, 9),
+        "lr_u": np.geomspace(0.001, 0.4, 9),
+        "lr_psi": [0.1, 0.3, 1.0] * 3,
+    }
     learner = AlgorithmS1(n_epochs=2, n_bias=3)
     found = Replicas.of(learner, **vectors, **how).fit(data, 6, 3)
     assert found.policy.shape == (9, 6, 3)
@@ -134,6 +140,7 @@ def test_bits_of_any_mixture(problem, rates, block, layout, keep, episode, behav
         assert_same(found[r], own.fit(data, *prior.shape))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(set(LEARNERS) - {"exact", "s1"}))
 def test_every_learner_has_replicas(small, name):
     """All that stream, on every kind of experience; betas of their own."""
@@ -453,6 +460,7 @@ def test_lines_of_optimum_and_prior(finished):
     assert gap.value == pytest.approx(group["exact"]["objective"] - group["objective"]["mean"], abs=1e-6)
 
 
+@pytest.mark.slow
 def test_settings_that_vary(tmp_path, monkeypatch):
     titles, draw = set(), pictures.bands
     monkeypatch.setattr(
@@ -475,6 +483,7 @@ def test_settings_that_vary(tmp_path, monkeypatch):
         assert group["exact"]["theta"] == pytest.approx(solve_soft_bellman(mdp, group["beta"]).theta, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_improved_learner_on_a_recorded_stream(tmp_path):
     collect(random_mdp(np.random.default_rng(2), 4, 2), 5, 100, 0).save(tmp_path / "t.npz")
     mdp = random_mdp(np.random.default_rng(2), 4, 2)

@@ -3,13 +3,11 @@
 import json
 import os
 import signal
-import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
-from helpers import ROOT, composed, random_mdp
+from helpers import ROOT, composed, ended, random_mdp, wait_until
 
 from erl_torch import InputError, estimate_mdp, iterate_biasing
 from erl_torch.reproduction import ARTIFACTS, SCALES, control, load, runner
@@ -104,6 +102,7 @@ def outputs(tmp_path_factory):
     return {name: load(name).assemble(its, "quick") for name, its in results.items()}
 
 
+@pytest.mark.slow
 def test_outputs_can_be_written_and_name_every_published_number(outputs, tmp_path, monkeypatch):
     monkeypatch.setattr(runner, "DPI", 30)
     for name, output in outputs.items():
@@ -121,16 +120,17 @@ def test_outputs_can_be_written_and_name_every_published_number(outputs, tmp_pat
         for c, row in zip(output.comparisons, about["comparisons"], strict=True):
             given = {"printed": row["printed"], "read off": row["read off"], "computed": row["computed"]}
             assert [name for name, value in given.items() if value is not None] == [COLUMNS[c.source]]
-    wanted = {
+    wanted: dict[str, list[float]] = {
         "figure_4": [-756.59, -1000.0, -946.76, -997.14, -947.14],
         "figure_5": [-1.29, -0.985, -0.957, -0.966, -0.966, -1.626, -0.956],
         "table_s2": [28, 38, 29, 58],
     }
     for name, numbers in wanted.items():
-        given = [c.reference for c in outputs[name].comparisons]
-        assert all(given.count(number) >= numbers.count(number) for number in numbers)
+        references = [c.reference for c in outputs[name].comparisons]
+        assert all(references.count(number) >= numbers.count(number) for number in numbers)
 
 
+@pytest.mark.slow
 def test_exact_numbers(outputs):
     """Everything that does not hang on a sample meets its oracle."""
     for name in ("figure_1", "figure_2", "figure_4"):
@@ -205,7 +205,8 @@ def test_cut_off_power_iterations():
 # -- the runner -------------------------------------------------------------------------------------------
 
 MODULE = """
-import os, time
+import os
+from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 from erl_torch.reproduction.artifact import Artifact, Output, compared
@@ -216,7 +217,9 @@ def units(scale, seed):
 def work(i, seed):
     with open(os.environ["DONE"], "a") as log:
         log.write(f"{i} ")
-    time.sleep(float(os.environ.get("NAP", 0)))
+    if i >= int(os.environ.get("HOLD", 6)):
+        (Path(os.environ["DONE"]).parent / "held").touch()
+        os.read(os.open(os.environ["GATE"], os.O_RDONLY), 1)  # until it is killed
     return {"value": np.random.default_rng([seed, i]).random(3), "i": i}
 
 def assemble(results, scale):
@@ -260,23 +263,22 @@ def finals(directory):
     return {p.name: p.read_bytes() for p in (directory / "small-quick-seed7").iterdir() if p.is_file()}
 
 
-def test_killed_and_started_again(small, tmp_path):
+def test_killed_and_started_again(small, tmp_path, start):
     """SIGKILL in the middle; then the rest, by two processes: the files of an undisturbed run."""
     runner.run([small], tmp_path / "whole", "quick", 7)
     assert sorted(worked(tmp_path)) == list("012345")
     assert len(finals(tmp_path / "whole")) == 4
     killed = tmp_path / "killed"
-    environment = {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{tmp_path}", "NAP": "0.3"}
-    first = subprocess.Popen([sys.executable, "start.py", killed], cwd=tmp_path, env=environment)
-    units = killed / "small-quick-seed7" / "units"
-    limit = time.monotonic() + 60
-    while len(list(units.glob("*.npz"))) < 2 and time.monotonic() < limit:
-        time.sleep(0.02)
+    gate = tmp_path / "gate"
+    os.mkfifo(gate)
+    more = {"PYTHONPATH": f"{ROOT}{os.pathsep}{tmp_path}", "HOLD": "3", "GATE": str(gate)}
+    first = start(sys.executable, "start.py", killed, cwd=tmp_path, env={**os.environ, **more})
+    wait_until((tmp_path / "held").exists, "the fourth unit")
     first.send_signal(signal.SIGKILL)
-    first.wait()
-    kept = len(list(units.glob("*.npz")))
-    assert 2 <= kept < 6
-    assert kept <= len(worked(tmp_path)) <= kept + 1
+    ended(first)
+    kept = len(list((killed / "small-quick-seed7" / "units").glob("*.npz")))
+    assert kept == 3
+    assert len(worked(tmp_path)) == kept + 1
     runner.run([small], killed, "quick", 7, processes=2)
     assert len(worked(tmp_path)) == 6 - kept
     assert finals(killed) == finals(tmp_path / "whole")
@@ -361,11 +363,11 @@ def test_command(tmp_path, capsys):
     assert names == {"units", *(f"figure_4.{kind}" for kind in ("csv", "json", "png", "svg"))}
 
 
-def test_help_is_light_and_names_the_artifacts():
+def test_help_is_light_and_names_the_artifacts(start):
     code = (
         "import runpy, sys; sys.argv = ['reproduce.py', '--help']; runpy.run_path('reproduce.py', run_name='__main__');"
         "assert not {'torch', 'matplotlib', 'numba'} & set(sys.modules)"
     )
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
-    assert done.returncode == 0, done.stderr
-    assert all(name in done.stdout for name in ARTIFACTS)
+    status, out, err = ended(start(sys.executable, "-c", code, cwd=ROOT))
+    assert status == 0, err
+    assert all(name in out for name in ARTIFACTS)

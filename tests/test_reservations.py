@@ -32,7 +32,7 @@ from erl_torch.empirical.uncertainty import Estimate, theta_uncertainty
 from erl_torch.envs.windy_cliff import WindyCliffEnv
 from erl_torch.learners import LEARNERS, EfficientS1
 from erl_torch.notes import collected, note
-from erl_torch.run.replicated import _reservations
+from erl_torch.run.replicas import reservations_of
 from erl_torch.run.training import train
 from erl_torch.solution import Status
 from erl_torch.solvers import solve_soft_bellman
@@ -52,7 +52,7 @@ def changed(data, **columns):
 @pytest.fixture(autouse=True)
 def no_pictures(monkeypatch):
     """Replicas always draw: seconds, and tests of their own."""
-    monkeypatch.setattr("erl_torch.run.replicated.pictures.bands", lambda *_, **__: np.zeros((4, 4, 3), np.uint8))
+    monkeypatch.setattr("erl_torch.run.replicas.pictures.bands", lambda *_, **__: np.zeros((4, 4, 3), np.uint8))
 
 
 @pytest.fixture(scope="module")
@@ -115,11 +115,13 @@ def having(lines, *texts):
 # -- end to end -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["true", "fuzz", "single"])
 def test_a_true_recording_has_no_note(tmp_path, recordings, name):
     assert notes(tmp_path, *of_stream(recordings[name]), learner=("evaluation.pictures=false",)) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("learner", "concerned"),
     [
@@ -306,6 +308,7 @@ def test_theta_far_from_the_data_is_counted_in_half_widths():
     assert math.isnan(half_widths(1.9, withheld))
 
 
+@pytest.mark.slow
 def test_published_s1_at_a_high_temperature_is_far_off_and_says_so(tmp_path, capsys):
     """Beta 2: its constant steps end tens of half widths from the data; each replica says what its run alone says."""
     full = ("learner.beta=2", "evaluation.pictures=false")
@@ -360,6 +363,7 @@ BUILT_IN = (
 )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env", BUILT_IN)
 def test_built_in_environments(tmp_path, env):
     """Their data have no reservation but for states never met, where there are. (Two passes may well end worse than the
@@ -541,7 +545,7 @@ def test_each_replica_of_a_seed_is_held_against_the_data_at_its_own_beta():
     rng = np.random.default_rng(0)
     mdp, prior = random_mdp(rng, 3, 2), np.full((3, 2), 0.5)
     experience, betas = erl_torch.Simulation(mdp, 5, 200, [7, 7, 8]), (0.5, 5.0, 5.0)
-    _, held = _reservations(experience, [EfficientS1(beta) for beta in betas], prior, None, True, lambda: None)
+    _, held = reservations_of(experience, [EfficientS1(beta) for beta in betas], prior, None, True, lambda: None)
     for r, beta in enumerate(betas):
         p, reward, _ = oracle.counted(experience.stream(r, prior), 3, 2)
         best, _ = oracle.soft_optimum(p, reward, prior, beta)

@@ -70,7 +70,7 @@ def test_authors_mazes(i):
     """theta and k are the authors'. The stored policies carry about seven digits: one exact step of soft policy
     iteration from a stored policy's own value, done densely here, moves it by up to 1.5e-7, onto ours."""
     mdp, known = maze(i)
-    beta, n_states, n_actions = float(known["beta"]), *mdp.reward.shape
+    beta, (n_states, n_actions) = float(known["beta"]), mdp.reward.shape
     bellman, biasing = solve_soft_bellman(mdp, beta, tol=1e-12), solve_biasing(mdp, beta, tol=1e-12)
     assert biasing.k == known["k"]
     for solution in (bellman, biasing):
@@ -157,6 +157,7 @@ def refined_gain(mdp, beta, prior, value):
     return error.min(), error.max()
 
 
+@pytest.mark.slow
 def test_a_thousand_certificates():
     """Every bound contains the extended-precision answer and is narrower than 1e-9; G never rises."""
     for seed in range(1000):

@@ -4,13 +4,12 @@ import contextlib
 import json
 import os
 import signal
-import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from helpers import ROOT, composed
+from helpers import ROOT, composed, ended
 from hydra.core.config_store import ConfigStore
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
@@ -22,7 +21,7 @@ from erl_torch.files import alone
 
 # A program of jobs that end in every way there is, without torch: what they do is in the key `end`.
 TOY = """
-import os, signal, sys, time
+import os, signal
 from pathlib import Path
 import hydra
 from hydra.core.config_store import ConfigStore
@@ -56,25 +55,13 @@ cli.run(main, "", Path("."), "toy")
 
 
 @pytest.fixture
-def toy(tmp_path):
+def toy(tmp_path, start):
     """Starts the program in ``tmp_path``; gives the process."""
     (tmp_path / "toy.py").write_text(TOY)
-
-    started = []
-
-    def start(*arguments):
-        process = subprocess.Popen(
-            [sys.executable, "toy.py", *arguments, "hydra/job_logging=none"],
-            cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)},
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        )  # fmt: skip
-        started.append(process)
-        return process
-
-    yield start
-    for process in started:
-        process.kill()
-        process.communicate()
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    return lambda *arguments: start(
+        sys.executable, "toy.py", *arguments, "hydra/job_logging=none", cwd=tmp_path, env=environment
+    )
 
 
 def rows(sweep):
@@ -84,8 +71,8 @@ def rows(sweep):
 @pytest.mark.parametrize("launcher", ["basic", "joblib"])
 def test_a_sweep_has_one_directory_whatever_its_name_is_made_of(tmp_path, toy, launcher):
     process = toy("-m", "x=2,3", "hydra.sweep.dir=of-${x}", f"hydra/launcher={launcher}")
-    _, err = process.communicate(timeout=120)
-    assert process.returncode == 0, err
+    code, _, err = ended(process)
+    assert code == 0, err
     (sweep,) = (path for path in tmp_path.iterdir() if path.is_dir())
     assert sweep.name == "of-1.0"
     assert [row["status"] for row in rows(sweep).values()] == ["converged"] * 2
@@ -104,8 +91,8 @@ def test_every_launcher_runs_all_jobs_and_lists_all_failures(tmp_path, toy):
         for name, (ends, more) in started.items()
     }
     for name, (ends, _) in started.items():
-        out, err = processes[name].communicate(timeout=120)
-        assert processes[name].returncode == 1, err
+        code, out, err = ended(processes[name])
+        assert code == 1, err
         found = rows(tmp_path / name)
         assert list(found) == ends
         assert [row["job"] for row in found.values()] == list(range(len(ends)))
@@ -174,8 +161,8 @@ def test_damaged_notes_and_results_leave_their_figures_out(tmp_path, content):
 def test_optuna_maximises_the_objective_past_failed_trials(tmp_path, toy):
     search = ["hydra/sweeper=optuna", "hydra.sweeper.n_trials=6", "hydra.sweeper.sampler.seed=0"]
     process = toy("-m", *search, "end=unlucky", "x=interval(0,1)", "hydra.sweep.dir=here")
-    out, err = process.communicate(timeout=120)
-    assert process.returncode == 1, err
+    code, out, err = ended(process)
+    assert code == 1, err
     trials = json.loads((tmp_path / "here" / "sweep.json").read_text())["jobs"]
     values = [row["objective"] for row in trials if row["status"] == "converged"]
     assert len(trials) == 6
@@ -206,8 +193,8 @@ def test_processes_at_once_never_share_a_directory(tmp_path, toy):
     pattern = pattern.replace("${slug:${env.name}}", "toy")
     processes = [toy(f"hydra.run.dir='{pattern}'") for _ in range(4)]
     for process in processes:
-        _, err = process.communicate(timeout=60)
-        assert process.returncode == 0, err
+        code, _, err = ended(process)
+        assert code == 0, err
     results = list((tmp_path / "runs" / "toy").glob("*/result.json"))
     assert len(results) == 4
     with alone(tmp_path), pytest.raises(InputError, match="no other run is writing to"), alone(tmp_path):
@@ -277,7 +264,7 @@ def test_slurm_jobs_without_a_result_are_queued_again_once(tmp_path, monkeypatch
         return {"any": "GONE", "7_0": "COMPLETED", "7_1": first, "7_2": "OUT_OF_MEMORY", "7_3": "CANCELLED"}
 
     monkeypatch.setattr(sweeps, "ASK_SLURM", 0)
-    monkeypatch.setattr(sweeps.time, "sleep", lambda _: None)
+    monkeypatch.setattr("time.sleep", lambda _: None)
     monkeypatch.setattr(sweeps, "_slurm_states", states)
     monkeypatch.setattr(sweeps, "_requeue", lambda job: requeued.append(job) is None and job != "7_4")
     sweeps._wait(tmp_path, {number: SlurmJob(number) for number in range(5)})

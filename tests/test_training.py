@@ -1,20 +1,17 @@
 """Whole runs: what a run directory holds, what is logged, and that bits repeat."""
 
-import contextlib
 import json
 import os
 import re
 import signal
-import subprocess
 import sys
-import time
 from concurrent.futures import ThreadPoolExecutor
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from helpers import ROOT, composed, events, random_mdp, undocumented
+from helpers import ROOT, composed, ended, events, random_mdp, undocumented, wait_until
 from omegaconf import OmegaConf
 
 from erl_torch import InputError, Solution, Status, Transitions, evaluate
@@ -94,6 +91,7 @@ def test_interval_of_the_data(finished):
     assert ends == pytest.approx([low, high], abs=1.1e-3)  # rounded outward
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("learner", sorted(set(LEARNERS) - {"s1", "exact"}))
 def test_every_learner_runs(tmp_path, learner):
     passes = [] if learner == "certainty_equivalence" else ["learner.n_epochs=2"]
@@ -158,6 +156,7 @@ def test_environment_without_a_model(tmp_path):
     assert events(tmp_path).Images("policy")[-1].height == 400
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["biasing", "soft_bellman"])
 def test_exact_learner(tmp_path, method):
     result = train(composed("learner=exact", f"learner.method={method}", "experience.n_episodes=1"), tmp_path)
@@ -216,34 +215,30 @@ ENDLESS = ("learner.n_epochs=100000", "evaluation.pictures=false")
 
 
 @pytest.fixture(scope="module")
-def typed(tmp_path_factory):
+def typed(tmp_path_factory, start_for_all):
     """(process, its directory) of each command below; started together, they share the cores."""
     commands = {
         "endless": ENDLESS,
         "sweep": ("-m", "learner.beta=2,-1,5", "seed=0,1", *SMALL, "evaluation.pictures=false"),
         "run": ("env=windy_cliff", *SMALL, "evaluation.pictures=false"),
     }
-    with contextlib.ExitStack() as stack:
-        started = {}
-        for name, arguments in commands.items():
-            directory = tmp_path_factory.mktemp("typed")
-            process = subprocess.Popen(
-                [sys.executable, str(ROOT / "train.py"), *arguments],
-                cwd=directory, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-            )  # fmt: skip
-            stack.enter_context(process)
-            stack.callback(process.kill)
-            started[name] = process, directory
-        yield started
+    started = {}
+    for name, arguments in commands.items():
+        directory = tmp_path_factory.mktemp("typed")
+        started[name] = start_for_all(sys.executable, ROOT / "train.py", *arguments, cwd=directory), directory
+    return started
+
+
+def learning(cwd):
+    """Whether the run below ``cwd`` has written what an epoch made."""
+    paths = list(cwd.rglob("events.*"))
+    reader = events(paths[0]) if paths else None
+    return reader and "s1/theta" in reader.Tags()["scalars"] and reader.Scalars("s1/theta")[-1].step > 0
 
 
 def signalled(cwd, send):
-    """Call ``send`` once the run below ``cwd`` is well inside its epochs."""
-    deadline = time.monotonic() + 120
-    while time.monotonic() < deadline and not list(cwd.rglob("events.*")):
-        time.sleep(0.05)
-    assert list(cwd.rglob("events.*"))
-    time.sleep(0.5)
+    """Call ``send`` once the run below ``cwd`` is inside its epochs."""
+    wait_until(lambda: learning(cwd), "an epoch")
     send()
 
 
@@ -253,7 +248,7 @@ def test_termination_keeps_what_was_learnt(typed, typed_here, tmp_path, number):
     if number == signal.SIGTERM:
         process, cwd = typed["endless"]
         signalled(cwd, lambda: process.send_signal(number))
-        (out, _), code = process.communicate(timeout=60), process.returncode
+        code, out, _ = ended(process)
     else:
         cwd = tmp_path
         with ThreadPoolExecutor(1) as pool:
@@ -273,8 +268,8 @@ def test_termination_keeps_what_was_learnt(typed, typed_here, tmp_path, number):
 
 def test_command_line_run(typed):
     process, cwd = typed["run"]
-    out, err = process.communicate(timeout=120)
-    assert process.returncode == 0, err
+    code, out, err = ended(process)
+    assert code == 0, err
     (directory,) = (cwd / "runs" / "windy_cliff").iterdir()
     assert {".hydra", "result.json", "solution.npz"} < {p.name for p in directory.iterdir()}
     assert f"runs/windy_cliff/{directory.name}" in out
@@ -288,8 +283,8 @@ def test_command_line_run(typed):
 def test_multirun_writes_one_named_directory_a_job(typed):
     """The job that cannot run says so and leaves nothing; the others finish."""
     process, cwd = typed["sweep"]
-    _, err = process.communicate(timeout=120)
-    assert process.returncode == 1
+    code, _, err = ended(process)
+    assert code == 1
     (sweep,) = (cwd / "runs" / "windy_cliff").iterdir()
     assert sweep.name.startswith("sweep-")
     names = [p.name.split("-pictures")[0] for p in sorted(sweep.iterdir()) if p.is_dir()]
@@ -375,20 +370,19 @@ def test_resume_takes_only_what_a_run_begins_with(typed_here, tmp_path, monkeypa
         assert typed_here("train.py", "resume=run", "env=mine:Id-v0")[0] == "imported"
 
 
-def test_help_is_complete_and_needs_no_torch(tmp_path):
-    done = subprocess.run(
-        [sys.executable, str(ROOT / "train.py"), "--help"],
-        cwd=tmp_path, capture_output=True, text=True, timeout=120, env={**os.environ, "PYTHONPROFILEIMPORTTIME": "1"},
-    )  # fmt: skip
-    assert done.returncode == 0
+def test_help_is_complete_and_needs_no_torch(tmp_path, start):
+    environment = {**os.environ, "PYTHONPROFILEIMPORTTIME": "1"}
+    code, out, err = ended(start(sys.executable, ROOT / "train.py", "--help", cwd=tmp_path, env=environment))
+    assert code == 0
     for text in ("python train.py env=windy_cliff", "windy_cliff,windy_frozen_lake", "lr_psi: 0.1", "conf/"):
-        assert text in done.stdout
-    assert " gymnasium\n" in done.stderr
+        assert text in out
+    assert " gymnasium\n" in err
     for module in (" torch\n", " numba\n", " scipy\n", " matplotlib\n"):
-        assert module not in done.stderr
+        assert module not in err
     assert not (tmp_path / "runs").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("overrides", "better"),
     [
@@ -420,6 +414,7 @@ def test_episodes_that_end_are_learnt_as_restarts(tmp_path):
     assert episodic["return"] > endless["return"]  # shorter
 
 
+@pytest.mark.slow
 def test_mdp_files_and_their_pictures(tmp_path):
     path = random_mdp(np.random.default_rng(0), 5, 3).save(tmp_path / "mdp.npz")
     result = train(composed("env=mdp", f"env.path={path}", *SMALL), tmp_path / "run")
@@ -470,6 +465,7 @@ def test_environments_by_id(given, expected):
     assert cli._by_id(given, ROOT / "conf") == expected
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stream", ["model", "episodes"])
 def test_control_tasks_are_learnt(tmp_path, monkeypatch, stream):
     """Pendulum on few samples: the learnt policy's return in the original lies far above the prior's."""

@@ -55,6 +55,7 @@ def coverage(mdp, beta, n_episodes, length, n=200):
     return inside / (n - withheld), above / (n - withheld), withheld
 
 
+@pytest.mark.slow
 def test_interval_covers_and_is_no_wider_than_it_need_be():
     """Of 100 intervals of 95%, 90 or more hold theta in 97% of all cases."""
     inside, _, withheld = coverage(CLIFF, 10.0, 100, 1000, n=100)
@@ -65,6 +66,7 @@ def test_interval_covers_and_is_no_wider_than_it_need_be():
     assert high - low <= 1.3 * 2 * 1.96 * estimate.standard_error
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("chance", [0.01, 0.005])
 def test_interval_covers_where_it_rests_on_rare_events(chance):
     """Ten or five events: an interval symmetric in standard errors misses most of what it misses on one side."""
@@ -74,6 +76,7 @@ def test_interval_covers_where_it_rests_on_rare_events(chance):
     assert withheld < 15
 
 
+@pytest.mark.slow
 def test_interval_covers_where_an_event_may_be_unseen():
     """State 1 costs 10 a step for ten steps; of 470 draws of the pair that leads there with chance .001 most see none.
     Value -+ 1.96 standard errors covers in 3 of 4."""
@@ -98,6 +101,7 @@ def test_interval_covers_where_a_slip_may_be_unseen():
     assert withheld == 0
 
 
+@pytest.mark.slow
 def test_interval_covers_where_the_best_is_the_luckiest():
     """Twenty arms that pay 0 and normal noise, beta 10^6: the best mean is 1.87 standard errors above 0, and in 2
     cases of 5 one is above 1.96."""
@@ -287,6 +291,7 @@ def test_bias_is_the_second_derivative_with_the_rows(optimal):
     assert (-found.bias if optimal else found.bias) == pytest.approx(expected, rel=5e-3)
 
 
+@pytest.mark.slow
 def test_policy_value_covers_and_matches_its_spread():
     policy = np.random.default_rng(0).dirichlet(np.full(4, 3.0), size=15)
     truth = objective(CLIFF, policy, UNIFORM, 3.0)

@@ -3,12 +3,11 @@
 import ast
 import json
 import os
-import subprocess
 import sys
 import tomllib
 import zipfile
 
-from helpers import ROOT
+from helpers import ROOT, ended
 
 
 def test_every_folder_is_a_package_of_the_wheel():
@@ -17,34 +16,36 @@ def test_every_folder_is_a_package_of_the_wheel():
     assert set(listed) == folders | {"erl_torch.conf"}
 
 
-def test_the_wheel_trains_in_an_empty_folder(tmp_path):
+def test_the_wheel_trains_in_an_empty_folder(tmp_path, start):
     wheels, home, empty = (tmp_path / name for name in ("wheels", "home", "empty"))
     empty.mkdir()
-    build = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--no-build-isolation", "-w", wheels, str(ROOT)]
     copy = tmp_path / "tree"  # building leaves folders behind
-    subprocess.run(["git", "-C", str(ROOT), "checkout-index", "-a", f"--prefix={copy}/"], check=True)
-    subprocess.run([*build[:-1], str(copy)], check=True, capture_output=True, text=True)
+    build = ["-m", "pip", "wheel", "-q", "--no-deps", "--no-build-isolation", "-w", wheels, copy]
+    for command in (["git", "-C", ROOT, "checkout-index", "-a", f"--prefix={copy}/"], [sys.executable, *build]):
+        code, _, err = ended(start(*command))
+        assert code == 0, err
     (wheel,) = wheels.iterdir()
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
         archive.extractall(home)
     assert {"erl_torch/py.typed", "erl_torch/conf/train.yaml", "erl_torch/conf/env/windy_cliff.yaml"} <= names
     assert not [name for name in names if name.startswith(("tests/", "conf/", "benchmarks/"))]
-    command = [sys.executable, "-m", "erl_torch.cli.commands", "train", "experience.n_episodes=5", "hydra.run.dir=run"]
-    done = subprocess.run(
-        command, cwd=empty, env={**os.environ, "PYTHONPATH": str(home)}, capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
+    tiny = ["experience.n_episodes=1", "experience.episode_length=100", "learner.n_epochs=1", "learner.n_bias=1"]
+    tiny += ["evaluation.horizon=100", "evaluation.pictures=false", "hydra.run.dir=run"]
+    # Uncompiled: a folder that Numba has never seen costs ten seconds of compiling.
+    environment = {**os.environ, "PYTHONPATH": str(home), "NUMBA_DISABLE_JIT": "1"}
+    command = [sys.executable, "-m", "erl_torch.cli.commands", "train", *tiny]
+    code, _, err = ended(start(*command, cwd=empty, env=environment))
+    assert code == 0, err
     assert json.loads((empty / "run" / "result.json").read_text())["env"] == "windy_cliff"
 
 
-def test_commands_are_named():
+def test_commands_are_named(start):
     for arguments, code in ((["--help"], 0), ([], 2), (["trian"], 2)):
-        command = [sys.executable, "-m", "erl_torch.cli.commands", *arguments]
-        done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
-        assert done.returncode == code
-        assert "erl-torch train" in done.stdout + done.stderr
-        assert (code == 0) == (done.stderr == "")
+        found = ended(start(sys.executable, "-m", "erl_torch.cli.commands", *arguments, cwd=ROOT))
+        assert found[0] == code
+        assert "erl-torch train" in found[1] + found[2]
+        assert (code == 0) == (found[2] == "")
 
 
 def test_scripts_are_a_few_lines():

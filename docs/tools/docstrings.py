@@ -12,9 +12,15 @@ import io
 import re
 import tokenize
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 from griffe import Class, Docstring, Extension, Object
+
+
+def _file(cls: Class) -> Path:
+    assert isinstance(cls.filepath, Path)  # only a namespace package has several
+    return cls.filepath
 
 
 class Docstrings(Extension):
@@ -27,7 +33,7 @@ class Docstrings(Extension):
 
     def on_class_members(self, *, node: Any, cls: Class, **_: Any) -> None:
         if isinstance(node, ast.ClassDef):
-            rows = [f"    {name}: {text}" for name, text in _described(node, cls.lines_collection[cls.filepath])]
+            rows = [f"    {name}: {text}" for name, text in _described(node, cls.lines_collection[_file(cls)])]
             before = cls.docstring.value.rstrip() if cls.docstring else ""
             if rows:
                 cls.docstring = Docstring("\n".join([before, "", "Attributes:", *rows]), parent=cls, lineno=cls.lineno)

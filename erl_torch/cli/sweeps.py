@@ -1,7 +1,7 @@
-"""Sweeps: a job that fails or dies costs no other job, and what became of each stands in one table.
+"""Sweeps: a job that fails or dies costs no other job, and one table shows the end of each.
 
-``cli.job`` leaves a note of every job in ``.jobs/`` of the sweep's directory: the process that waits for the jobs
-may be another one, on another machine, and need not live as long. ``sweep.json`` is made of these notes and of the
+``cli.job`` writes a note of every job to ``.jobs/`` in the sweep's directory, because the process that waits for the
+jobs may be another one, on another machine, and need not live as long. ``sweep.json`` is made from these notes and the
 jobs' ``result.json``, at the end of a sweep and whenever ``python -m erl_torch.cli.sweeps DIRECTORY`` is called.
 """
 
@@ -27,36 +27,36 @@ from hydra.core.utils import JobReturn, JobStatus
 from hydra.plugins.launcher import Launcher
 from omegaconf import DictConfig, flag_override, read_write
 
-from erl_torch.checks import InputError
+from erl_torch.checks import InputError, is_number
 from erl_torch.files import alone, read_json, write_json
 from erl_torch.output import lasting
 
 EXTRAS = {"joblib": "joblib", "submitit_slurm": "slurm", "submitit_local": "slurm", "optuna": "optuna"}
 COLUMNS = ("theta", "objective", "gap", "seconds")  # of result.json
-LONG = r"(?<==)-?\d*\.\d{5,}(e-?\d+)?$"
-OPEN = ("waiting", "running")
-OVER = ("ended", "failed")  # what a note says of a job that need not be started again
-# What Slurm calls the end of a job, whatever brought it about.
-ENDS = {"BOOT_FAIL", "CANCELLED", "COMPLETED", "DEADLINE", "FAILED", "NODE_FAIL", "OUT_OF_MEMORY", "PREEMPTED"}
-ENDS |= {"TIMEOUT", "GONE"}
-ASK_SLURM = 5.0  # seconds between questions
+LONG_NUMBER = r"(?<==)-?\d*\.\d{5,}(e-?\d+)?$"
+UNFINISHED = ("waiting", "running")
+FINISHED = ("ended", "failed")  # statuses of jobs that are not started again
+# Slurm's names of the end of a job, whatever its cause; "GONE" is ours, of a job that Slurm no longer lists.
+SLURM_ENDS = {"BOOT_FAIL", "CANCELLED", "COMPLETED", "DEADLINE", "FAILED", "NODE_FAIL", "OUT_OF_MEMORY", "PREEMPTED"}
+SLURM_ENDS |= {"TIMEOUT", "GONE"}
+ASK_SLURM = 5.0  # seconds between questions to Slurm
 
 
 def presets() -> None:
-    """Defaults that suit this project for the plugins that are installed, under the plugins' own names."""
-    Plugins.instance()  # each registers its own first
+    """Register this project's defaults for the plugins that are installed, under the plugins' own names."""
+    Plugins.instance()  # the plugins register theirs first
     store = ConfigStore.instance()
     with contextlib.suppress(ImportError):
         from hydra_plugins.hydra_submitit_launcher.config import SlurmQueueConf
 
-        # A job out of time saves a checkpoint and queues again, as often as it takes.
+        # A job whose time is up saves a checkpoint and queues again, as often as it takes.
         slurm = SlurmQueueConf(cpus_per_task=1, max_num_timeout=1000)
         store.store(group="hydra/launcher", name="submitit_slurm", node=slurm, provider="erl_torch")
     with contextlib.suppress(ImportError):
         from hydra_plugins.hydra_optuna_sweeper.config import Direction, OptunaSweeperConf
 
-        logging.getLogger("alembic").setLevel(logging.WARNING)  # of Optuna's databases; none is used
-        # The objective is a reward, and a trial that fails is no reason to end the study.
+        logging.getLogger("alembic").setLevel(logging.WARNING)  # it speaks of databases, and none is used
+        # The objective is a reward; a trial that fails does not end the study.
         optuna = OptunaSweeperConf(direction=Direction.maximize, max_failure_rate=1.0)
         store.store(group="hydra/sweeper", name="optuna", node=optuna, provider="erl_torch")
 
@@ -64,13 +64,13 @@ def presets() -> None:
 # -- notes and the table ----------------------------------------------------------------------------
 
 
-def note(sweep: Path, number: int, status: str, **more: Any) -> None:
-    """Write down that job ``number`` is running, ended or failed; what else its note says stays."""
+def note(sweep: Path, number: int, status: str, **more: str | float | None) -> None:
+    """Note that job ``number`` is running, ended or failed, and ``more``; the rest of an earlier note stays."""
     write_json(_note(sweep, number), _read(_note(sweep, number)) | {"status": status, **more})
 
 
 def fail(sweep: Path, number: int, complaint: str) -> None:
-    """Note that job ``number`` has failed, and say so."""
+    """Note that job ``number`` has failed, and print the complaint."""
     print(f"error: job {number}: {complaint}", file=sys.stderr)
     note(sweep, number, "failed", complaint=complaint)
 
@@ -80,7 +80,7 @@ def _note(sweep: Path, number: int) -> Path:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """A JSON file, or nothing where there is none that can be read."""
+    """The content of a JSON file; empty where there is none that can be read."""
     try:
         return read_json(path, "path", "") or {}
     except InputError:
@@ -90,17 +90,17 @@ def _read(path: Path) -> dict[str, Any]:
 def _rows(sweep: Path) -> list[dict[str, Any]]:
     """The table of ``sweep.json``. Raises InputError where there is none, or a damaged one."""
     path = sweep / "sweep.json"
-    otherwise = "the same command again makes it anew"
-    found = read_json(path, "directory", otherwise)
-    if found is None:
+    remedy = "the same command again makes it anew"
+    content = read_json(path, "directory", remedy)
+    if content is None:
         raise InputError("directory", sweep, "that of a sweep: it holds a sweep.json")
-    rows = found.get("jobs")
+    rows = content.get("jobs")
     if not (isinstance(rows, list) and rows and all(map(_is_row, rows))):
-        raise InputError("directory", path, f"what a sweep writes: a row of every job; {otherwise}")
+        raise InputError("directory", path, f"what a sweep writes: a row of every job; {remedy}")
     return rows
 
 
-def _is_row(row: Any) -> bool:
+def _is_row(row: object) -> bool:
     return (
         isinstance(row, dict)
         and isinstance(row.get("job"), int)
@@ -111,9 +111,9 @@ def _is_row(row: Any) -> bool:
     )
 
 
-def _figure(value: Any) -> float | None:
+def _figure(value: object) -> float | None:
     """A number of a ``result.json``; None for anything else."""
-    return value if isinstance(value, (int, float)) and not isinstance(value, bool) else None
+    return value if is_number(value) else None
 
 
 def _plan(sweep: Path, jobs: dict[int, list[str]], anew: bool) -> None:
@@ -126,10 +126,10 @@ def _plan(sweep: Path, jobs: dict[int, list[str]], anew: bool) -> None:
 
 
 def collect(sweep: Path) -> list[dict[str, Any]]:
-    """What has become of the jobs, also written to ``sweep.json``.
+    """Collect the state of all jobs, and write it to ``sweep.json``.
 
     Returns:
-        a row a job: job, overrides, status (of the result, or failed, running, waiting), complaint, theta,
+        one row per job: job, overrides, status (of the result, or failed, running, waiting), complaint, theta,
         objective, gap, seconds and directory; None where there is no such figure.
 
     Raises:
@@ -137,8 +137,8 @@ def collect(sweep: Path) -> list[dict[str, Any]]:
     """
     rows = _rows(sweep)
     for row in rows:
-        said = row | _read(_note(sweep, row["job"]))
-        row |= {key: (said if _is_row(said) else row).get(key) for key in ("status", "complaint", "directory")}
+        noted = row | _read(_note(sweep, row["job"]))
+        row |= {key: (noted if _is_row(noted) else row).get(key) for key in ("status", "complaint", "directory")}
         result = _read(sweep / row["directory"] / "result.json") if row["directory"] else {}
         row |= {key: _figure(result.get(key)) for key in COLUMNS}
         if row["status"] == "ended":
@@ -146,7 +146,7 @@ def collect(sweep: Path) -> list[dict[str, Any]]:
         if row["directory"] and not (sweep / row["directory"]).exists():
             row["directory"] = None  # bad input: nothing was written
     write_json(sweep / "sweep.json", {"jobs": rows})
-    if all(row["status"] not in OPEN for row in rows):
+    if all(row["status"] not in UNFINISHED for row in rows):
         shutil.rmtree(sweep / ".jobs", ignore_errors=True)
     return rows
 
@@ -156,12 +156,14 @@ def failures(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def table(sweep: Path, rows: Sequence[dict[str, Any]]) -> str:
-    """The rows of ``collect`` as text, with a line a failure below."""
+    """The rows of ``collect`` as text, with one line per failure below."""
     shared = [o for o in rows[0]["overrides"] if len(rows) > 1 and all(o in row["overrides"] for row in rows)]
 
     def own(row: dict[str, Any]) -> str:
-        # Sweepers draw steps of 17 digits.
-        return " ".join(re.sub(LONG, lambda n: f"{float(n[0]):.4g}", o) for o in row["overrides"] if o not in shared)
+        # Sweepers draw numbers of 17 digits.
+        return " ".join(
+            re.sub(LONG_NUMBER, lambda n: f"{float(n[0]):.4g}", o) for o in row["overrides"] if o not in shared
+        )
 
     def figure(name: str, value: float | None) -> str:
         return "" if value is None else f"{value:.1f}" if name == "seconds" else f"{value:.6g}"
@@ -179,7 +181,7 @@ def table(sweep: Path, rows: Sequence[dict[str, Any]]) -> str:
     ]
     with contextlib.suppress(ValueError):
         sweep = sweep.resolve().relative_to(Path.cwd())
-    failed, unfinished = failures(rows), sum(row["status"] in OPEN for row in rows)
+    failed, unfinished = failures(rows), sum(row["status"] in UNFINISHED for row in rows)
     counts = f"{len(rows)} jobs, {len(failed)} failed" + (f", {unfinished} not finished" if unfinished else "")
     return "\n".join(
         [
@@ -197,13 +199,13 @@ def table(sweep: Path, rows: Sequence[dict[str, Any]]) -> str:
 
 @contextlib.contextmanager
 def patient_launchers() -> Iterator[list[Path]]:
-    """Every launcher that Hydra makes inside is a ``_Patient`` one; gives the directories of their sweeps."""
+    """Make every launcher of Hydra's in this block a ``_Patient`` one; yields the directories of their sweeps."""
     sweeps: list[Path] = []
     make = Plugins.instantiate_launcher
 
-    def instantiate_launcher(self: Plugins, *, config: DictConfig, **more: Any) -> Launcher:
+    def instantiate_launcher(self: Plugins, *, config: DictConfig, **more: Any) -> Launcher:  # Any: as Hydra has it
         directory = str(config.hydra.sweep.dir)
-        # One directory for all jobs: its name may have a key in it that is swept over.
+        # One directory for all jobs, even where its name depends on a key that is swept over.
         quoted = directory.replace("\\", "\\\\").replace("'", "\\'")
         given = config.hydra.overrides.hydra
         with read_write(given), flag_override(given, "struct", False):
@@ -218,14 +220,15 @@ def patient_launchers() -> Iterator[list[Path]]:
 
 
 class _Patient(Launcher):
-    """Runs jobs through ``inner`` until each has ended or failed by itself. One whose process dies is started once
-    more, in the same directory: it goes on from its checkpoint there."""
+    """Run jobs through ``inner`` until each has ended or failed by itself. A job whose process dies is started once
+    more, in the same directory, where it goes on from its checkpoint.
+    """
 
     def __init__(self, inner: Launcher, sweep: Path, sweeps: list[Path]) -> None:
         self.inner, self.sweep, self.sweeps = inner, sweep, sweeps
 
-    def setup(self, **_: Any) -> None:
-        """Nothing: ``inner`` is ready."""
+    def setup(self, **_: object) -> None:
+        """Do nothing: ``inner`` is ready."""
 
     def launch(self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> Sequence[JobReturn]:
         jobs = {n: list(overrides) for n, overrides in enumerate(job_overrides, initial_job_idx)}
@@ -235,7 +238,8 @@ class _Patient(Launcher):
         todo = dict(jobs)
         died: set[int] = set()
         while todo:
-            # Launchers number from the first. A process that dies takes the pool's others with it: alone, then.
+            # Launchers number jobs from the first one. A process that dies takes the others of its pool with it, so a
+            # job whose process died runs alone.
             first = min(todo)
             together = takewhile(lambda n: n in todo and n not in died, count(first))
             numbers = [first] if first in died else list(together)
@@ -250,7 +254,7 @@ class _Patient(Launcher):
                 if error is not None:
                     self._wait_for_writer(number)
                 status = _read(_note(self.sweep, number)).get("status")
-                if status in OVER:
+                if status in FINISHED:
                     del todo[number]
                 elif status == "running" and number not in died:
                     died.add(number)
@@ -265,12 +269,12 @@ class _Patient(Launcher):
         return [self._returned(number, overrides) for number, overrides in jobs.items()]
 
     def _wait_for_writer(self, number: int) -> None:
-        """A pool that breaks says so before the last of its processes is dead."""
+        """Wait for the job's process to end. A broken pool raises before all its processes are dead."""
         for _ in range(300):
-            said = _read(_note(self.sweep, number))
-            if said.get("status") != "running":
+            noted = _read(_note(self.sweep, number))
+            if noted.get("status") != "running":
                 return
-            with contextlib.suppress(InputError, FileNotFoundError), alone(self.sweep / said["directory"]):
+            with contextlib.suppress(InputError, FileNotFoundError), alone(self.sweep / noted["directory"]):
                 return
             time.sleep(0.1)
 
@@ -281,21 +285,22 @@ class _Patient(Launcher):
 
 @contextlib.contextmanager
 def _patient_submitit(inner: Launcher, sweep: Path, numbers: Sequence[int]) -> Iterator[None]:
-    """Submitit's launchers give up at the first job that fails; inside, they wait for all."""
+    """Let submitit's launchers wait for all jobs in this block. By themselves they give up at the first that fails."""
     if not type(inner).__module__.startswith("hydra_plugins.hydra_submitit_launcher"):
         yield
         return
     import submitit
 
-    class Over:
+    class Finished:
         def results(self) -> list[None]:
             return [None]
 
     map_array = submitit.AutoExecutor.map_array
 
-    def and_wait(self: Any, *arguments: Any) -> list[Over]:
+    # Any: submitit has no types here.
+    def and_wait(self: Any, *arguments: Any) -> list[Finished]:
         _wait(sweep, dict(zip(numbers, map_array(self, *arguments), strict=True)))
-        return [Over() for _ in numbers]
+        return [Finished() for _ in numbers]
 
     submitit.AutoExecutor.map_array = and_wait
     try:
@@ -305,8 +310,9 @@ def _patient_submitit(inner: Launcher, sweep: Path, numbers: Sequence[int]) -> I
 
 
 def _wait(sweep: Path, jobs: dict[int, Any]) -> None:
-    """Return when every submitit job has ended, failed, or is lost. A job that Slurm no longer runs and that left
-    no result is queued again, once, unless it was cancelled."""
+    """Return when every submitit job has ended, failed, or is lost. A job that Slurm no longer runs and that left no
+    result is queued again, once, unless it was cancelled.
+    """
     array = next(iter(jobs.values())).job_id.split("_")[0]
     on_slurm = type(next(iter(jobs.values()))).__name__ == "SlurmJob"
     left, asked = dict(jobs), -math.inf
@@ -321,26 +327,26 @@ def _wait(sweep: Path, jobs: dict[int, Any]) -> None:
             state = states.get(job.job_id, states.get("any"))
             if job.paths.result_pickle.exists():
                 error = job.exception()
-                if error is not None and _read(_note(sweep, number)).get("status") not in OVER:
+                if error is not None and _read(_note(sweep, number)).get("status") not in FINISHED:
                     fail(sweep, number, str(error).strip().splitlines()[-6])
                 del left[number]
             elif not on_slurm:
                 if job.done(force_check=True) and not job.paths.result_pickle.exists():
                     del left[number]
-            elif state in ENDS and number not in missing:
+            elif state in SLURM_ENDS and number not in missing:
                 missing.add(number)  # a shared file system may need a moment to show the result
-            elif state in ENDS and (state == "CANCELLED" or number in again or not _requeue(job.job_id)):
+            elif state in SLURM_ENDS and (state == "CANCELLED" or number in again or not _requeue(job.job_id)):
                 fail(sweep, number, f"Slurm job {job.job_id} ended without a result: {state}")
                 del left[number]
             elif state is not None:
-                if state in ENDS:
+                if state in SLURM_ENDS:
                     again.add(number)
                     print(f"job {number}: {state}, queued again", file=sys.stderr)
                 missing.discard(number)
 
 
 def _slurm_states(array: str) -> dict[str, str]:
-    """State of each task of a job array; nothing where Slurm does not answer: it is asked again."""
+    """The state of each task of a job array; empty where Slurm does not answer, and is to be asked again."""
     command = ["squeue", "--noheader", "--array", "--states=all", f"--jobs={array}", "--format=%i %T"]
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode:

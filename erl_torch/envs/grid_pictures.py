@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
@@ -28,6 +29,12 @@ TILE_COLOURS = {
 ARROW = "#1b4f9c"
 WIND = "#b9c6d3"
 SHARE = "#f08c00"
+
+
+def grid_of(env: gym.Env[Any, Any]) -> GridWorld | None:
+    """The grid of an environment of this package; None of others."""
+    grid = getattr(env.unwrapped, "grid", None)
+    return grid if isinstance(grid, GridWorld) else None
 
 
 def policy_picture(

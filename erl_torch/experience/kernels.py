@@ -68,6 +68,19 @@ def _pcg64(typing, high, low, increment_high, increment_low):
     return signature, generate
 
 
+def _pcg64_uncompiled(high, low, increment_high, increment_low):
+    """``_pcg64`` in whole numbers of any size."""
+    increment = int(increment_high) << 64 | int(increment_low)
+    state = (int(high) << 64 | int(low)) * 0x2360ED051FC65DA44385DF649FCCF645 + increment
+    high, low = state >> 64 & 2**64 - 1, state & 2**64 - 1
+    twice = (high ^ low) << 64 | (high ^ low)
+    return np.uint64(high), np.uint64(low), np.uint64(twice >> (high >> 58) & 2**64 - 1)
+
+
+if numba.config.DISABLE_JIT:
+    _pcg64 = _pcg64_uncompiled
+
+
 @numba.njit(cache=True, error_model="numpy", nogil=True)
 def _uniforms(state, out, n):
     """out[:n, i] gets what ``Generator(PCG64).random(n)`` gives; state [4, lanes] uint64 (see ``_pcg64``) moves on."""

@@ -66,6 +66,11 @@ class Simulation:
 ReplicaExperience = Transitions | Sequence[Transitions] | Simulation
 
 
+def streams_of(experience: Transitions | Sequence[Transitions]) -> Sequence[Transitions]:
+    """Recorded streams, one for all or one per replica."""
+    return [experience] if isinstance(experience, Transitions) else experience
+
+
 def tuples_of(experience: ReplicaExperience, r: int, prior: np.ndarray) -> Transitions:
     """The stream of one replica."""
     if isinstance(experience, Transitions):
@@ -80,5 +85,5 @@ def fits(experience: ReplicaExperience, n_replicas: int, tuple_bytes: int) -> bo
         if experience.keep is not None:
             return bool(experience.keep)
     else:
-        n_tuples = max(len(data) for data in ([experience] if isinstance(experience, Transitions) else experience))
+        n_tuples = max(map(len, streams_of(experience)))
     return n_tuples * n_replicas * tuple_bytes <= KEEP_BYTES

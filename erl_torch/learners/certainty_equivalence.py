@@ -10,7 +10,7 @@ The action a' of the stream is not used, and the stream may come from any behavi
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -20,7 +20,7 @@ import torch
 from erl_torch import checks
 from erl_torch.empirical.counts import EmpiricalMDP, EmpiricalProblem, empirical_mdp
 from erl_torch.experience.experience import Experience
-from erl_torch.learners.learner import columns, epochs
+from erl_torch.learners.learner import Streaming, columns, message
 from erl_torch.mdp.tabular import check_policy
 from erl_torch.solution import Solution, Status, proven
 from erl_torch.solvers.soft_bellman import solve_problem
@@ -69,7 +69,7 @@ class CertaintyEquivalenceStream:
 
 
 @dataclass(frozen=True, eq=False)
-class CertaintyEquivalence:
+class CertaintyEquivalence(Streaming[CertaintyEquivalenceState, CertaintyEquivalenceStream]):
     """Counts -> empirical model -> soft policy iteration.
 
     Args:
@@ -82,9 +82,8 @@ class CertaintyEquivalence:
         InputError: an argument out of its range.
     """
 
-    stream_bytes: ClassVar[int] = 1  # a tuple in a prepared stream: counts alone
-    averages_exp_reward: ClassVar[bool] = False
-    drawn_from_prior: ClassVar[str] = ""
+    states: ClassVar[tuple[type, ...]] = (CertaintyEquivalenceState,)
+    stream_bytes: ClassVar[int] = 1  # counts alone
 
     beta: float = 10.0
     tol: float = 1e-10
@@ -100,14 +99,7 @@ class CertaintyEquivalence:
     def fit(self, transitions: Experience, n_states: int, n_actions: int) -> Solution:
         """Count and solve. Status REDUCIBLE, with a message, where the states that the stream shows are not one
         recurrent class; theta is then that of the closed set of states (of several, the most visited)."""
-        (state,) = self.iterate(transitions, n_states, n_actions)
-        return self.solution(state, [state.metrics()])
-
-    def iterate(
-        self, transitions: Experience, n_states: int, n_actions: int, state: CertaintyEquivalenceState | None = None
-    ) -> Iterator[CertaintyEquivalenceState]:
-        """Yield the one state."""
-        yield from epochs(self, transitions, n_states, n_actions, state)
+        return super().fit(transitions, n_states, n_actions)
 
     def finished(self, state: CertaintyEquivalenceState) -> bool:
         """Once solved."""
@@ -170,10 +162,10 @@ class CertaintyEquivalence:
     def solution(
         self,
         state: CertaintyEquivalenceState,
-        history: list[dict[str, float]] | None = None,
-        failure: ArithmeticError | None = None,
+        history: Sequence[Mapping[str, float]] = (),
+        failure: BaseException | None = None,
     ) -> Solution:
-        """The solution that ``state`` stands for; ``history`` holds one ``metrics()``."""
+        """The solution that ``state`` stands for."""
         answer = state.answer or Solution(
             policy=state.policy,
             u=state.u,
@@ -183,8 +175,8 @@ class CertaintyEquivalence:
             reward_bias=state.reward_bias,
             reward_bias_max=0.0,
             n_steps=0,
-            status=Status.NON_FINITE if failure else Status.STOPPED,
-            message=str(failure or ""),
+            status=self.ended(state, failure),
+            message=message(failure),
             beta=self.beta,
         )
-        return replace(answer, history=columns(history or []))
+        return replace(answer, history=columns(history))

@@ -6,15 +6,20 @@ iteration, one state a Newton step (``erl_torch.solvers``).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import torch
 
 from erl_torch import checks
+from erl_torch.checks import InputError
+from erl_torch.experience.experience import Experience
+from erl_torch.learners.learner import columns
 from erl_torch.mdp.tabular import TabularMDP, check_policy
-from erl_torch.solution import Solution, Status
+from erl_torch.problem import Problem
+from erl_torch.solution import Solution, Status, proven
 from erl_torch.solvers.biasing import KL_TOLERANCE, BiasingState, iterate_biasing, solve_biasing
 from erl_torch.solvers.problem import BellmanProblem
 from erl_torch.solvers.result import bias, ended, reducible_solution, spread
@@ -32,6 +37,7 @@ class ExactState:
     theta_bounds: tuple[float, float]
     kl_max: float  # KL(optimal dynamics || p), largest over (s,a), nats; 0 for soft_bellman
     value: np.ndarray  # [n], on the states that the start leads to
+    mdp: TabularMDP | None = None  # that is solved
 
     @property
     def reward_bias_max(self) -> float:
@@ -63,6 +69,12 @@ class Exact:
     Raises:
         InputError: an argument out of its range.
     """
+
+    unit: ClassVar[str] = "iterations"
+    needs_model: ClassVar[bool] = True
+    states: ClassVar[tuple[type, ...]] = ()
+    averages_exp_reward: ClassVar[bool] = False
+    drawn_from_prior: ClassVar[str] = ""
 
     beta: float = 10.0
     method: str = "biasing"
@@ -106,6 +118,7 @@ class Exact:
                 theta_bounds=state.theta_bounds,
                 kl_max=kl_max,
                 value=state.value,
+                mdp=mdp,
             )
 
         if self.method == "soft_bellman":
@@ -118,17 +131,59 @@ class Exact:
             if problem.is_narrow(state.theta_bounds, self.tol, state.policy):
                 return
 
-    def solution(self, mdp: TabularMDP, state: ExactState, history: list[dict[str, float]], stopped: bool) -> Solution:
-        """The solution that ``state`` stands for, with the record of the iterations."""
+    def run(
+        self, problem: Problem, experience: Experience | None = None, state: ExactState | None = None
+    ) -> Iterator[ExactState]:
+        """``iterate`` on the model of ``problem``. Raises InputError where there is none."""
+        return self.iterate(self._model(problem))
+
+    def start(self, problem: Problem) -> ExactState:
+        """``init``, of the model of ``problem``. Raises InputError where there is none."""
+        return replace(self.init(problem.n_states, problem.n_actions), mdp=self._model(problem))
+
+    def _model(self, problem: Problem) -> TabularMDP:
+        if problem.mdp is None:
+            allowed = f"one that learns from experience: no model of {problem.name} is known"
+            raise InputError("learner", "exact", allowed)
+        return problem.mdp
+
+    def position(self, state: ExactState) -> int:
+        """Iterations so far."""
+        return state.step
+
+    def work(self, state: ExactState) -> int:
+        """Iterations so far."""
+        return state.step
+
+    def total(self, experience: Experience | None) -> None:
+        """Nothing tells."""
+
+    def milestone(self, state: ExactState) -> str:
+        """Every iteration is one."""
+        return f"biasing iteration {state.step - 1}" if self.method == "biasing" else f"Newton step {state.step}"
+
+    def progress(self, state: ExactState) -> str:
+        """theta and its bounds."""
+        return f"theta {state.theta:.6f} {proven(state.theta_bounds, None)}"
+
+    def solution(
+        self,
+        state: ExactState,
+        history: Sequence[Mapping[str, float]] = (),
+        failure: BaseException | None = None,
+    ) -> Solution:
+        """The solution that ``state`` (of ``start`` or ``iterate``) stands for; STOPPED with any ``failure``."""
+        mdp = state.mdp
+        assert mdp is not None
         problem = BellmanProblem.of(mdp, self.beta, self.prior_policy)
         if not len(state.value):  # no iteration could be made
             return reducible_solution(mdp, problem, self.prior_policy)
         below = [i for i, row in enumerate(history) if row["kl_max"] < KL_TOLERANCE]
         k = below[0] if below and self.method == "biasing" else None
         value, bounds = state.value, state.theta_bounds
-        if not stopped and state.step < self.max_steps:
+        if failure is None and state.step < self.max_steps:
             value, bounds = polish(problem, value, bounds, self.tol)
         solution = ended(mdp, problem, value, bounds, self.tol, state.step, self.max_steps, self.prior_policy, k)
-        if stopped:
+        if failure is not None:
             solution = replace(solution, status=Status.STOPPED, message="")
-        return replace(solution, history={name: np.array([row[name] for row in history]) for name in history[0]})
+        return replace(solution, history=columns(history))

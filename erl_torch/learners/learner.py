@@ -1,15 +1,21 @@
-"""What ``iterate`` and ``fit`` are for every learner that streams: steps until it is finished, and their record."""
+"""The contract of learners: ``Learner`` and ``State``; ``Streaming`` does what is the same for all that stream."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import numpy as np
+import torch
 
 from erl_torch import checks
 from erl_torch.experience.experience import Experience
-from erl_torch.solution import Solution
+from erl_torch.problem import Policy, Problem
+from erl_torch.solution import Solution, Status
+
+Table = torch.Tensor | np.ndarray | None
+Metric = float | np.ndarray  # of one learner; [R] of replicas
 
 
 class NonFiniteError(ArithmeticError):
@@ -23,33 +29,240 @@ class NonFiniteError(ArithmeticError):
         return f"step {self.step}: {self.cause}"
 
 
-def epochs(learner: Any, transitions: Experience, n_states: int, n_actions: int, state: Any = None) -> Iterator[Any]:
-    """The states of ``learner`` after each epoch, from ``state`` on, until it is finished.
+class State(Protocol):
+    """What a learner knows after an epoch: a value, never changed in place."""
 
-    Raises what its ``step`` raises.
-    """
-    checks.instance("transitions", transitions, Experience, "a recording, as of Transitions or open_recording")
-    stream = learner.prepare(transitions, n_states, n_actions)
-    state = learner.init(n_states, n_actions) if state is None else state
-    while not learner.finished(state):
-        state = learner.step(state, stream)
-        yield state
+    @property
+    def policy(self) -> Policy:
+        """The policy that it stands for."""
+
+    def metrics(self) -> Mapping[str, Metric]:
+        """What is logged, by name (docs/logging.md): the same names in every state of a run."""
+
+
+class TabularState(State, Protocol):
+    """The state of one learner of tables."""
+
+    @property
+    def theta(self) -> float | None:
+        """theta, reward a step; None where none is estimated."""
+
+    @property
+    def reward_bias(self) -> torch.Tensor | None:
+        """delta of eq. (9), reward, [S, A]; None of a learner that has none."""
+
+    def metrics(self) -> Mapping[str, float]: ...
+
+
+class StreamState(TabularState, Protocol):
+    """The state of a learner that streams tuples."""
+
+    @property
+    def epoch(self) -> int:
+        """Passes over the stream, since the start or since the present biasing iteration began."""
+
+    @property
+    def n_tuples(self) -> int:
+        """Tuples streamed since the start."""
+
+
+S = TypeVar("S", bound=State)
+T = TypeVar("T", bound=StreamState)
+E = TypeVar("E", contravariant=True)  # kind of experience
+A = TypeVar("A", covariant=True)  # kind of solution
+Prepared = TypeVar("Prepared")
+
+
+class Learner(Protocol[S, E, A]):
+    """What a run asks of a learner: a frozen dataclass whose fields are its settings, checked when it is made."""
+
+    unit: ClassVar[str]  # what ``position`` counts: "tuples", or "iterations" of a solver
+    needs_model: ClassVar[bool]  # it solves ``problem.mdp``, and learns nothing from experience
+
+    @property
+    def states(self) -> tuple[type, ...]:
+        """Classes that its states are made of: what a checkpoint of it may hold."""
+
+    def start(self, problem: Problem) -> S:
+        """The state before anything is learnt: its policy is the prior. Raises InputError for a prior of other sizes,
+        or a problem that it cannot learn or solve."""
+
+    def run(self, problem: Problem, experience: E | None, state: S | None = None) -> Iterator[S]:
+        """Yield the state after each epoch, from ``state`` on, until the learner is finished.
+
+        Raises:
+            InputError: a problem or experience that it cannot learn from.
+            NonFiniteError: numbers that left double precision; the state yielded last is still good.
+        """
+
+    def position(self, state: S) -> int:
+        """Where the records of ``state`` stand: tuples streamed so far, or iterations."""
+
+    def work(self, state: S) -> int:
+        """What is done so far, for the progress bar and the rate."""
+
+    def total(self, experience: E | None) -> int | None:
+        """What ``work`` comes to at most; None where nothing tells."""
+
+    def milestone(self, state: S) -> str:
+        """What has come to its end with ``state``, in words; "" in between. Milestones are always recorded."""
+
+    def progress(self, state: S) -> str:
+        """Where ``state`` stands, for the progress bar."""
+
+    def solution(self, state: S, history: Sequence[Mapping[str, Any]] = (), failure: BaseException | None = None) -> A:
+        """What ``state`` stands for.
+
+        Args:
+            state: of this learner.
+            history: ``metrics()`` of the states up to ``state``.
+            failure: what ended the run before the learner was finished.
+        """
+
+
+class TabularLearner(Learner[S, Experience, Solution], Protocol[S]):
+    """One learner of tables. For those that stream tuples, ``Streaming`` has most of it."""
+
+    @property
+    def beta(self) -> float:
+        """Inverse temperature, 1/reward."""
+
+    @property
+    def prior_policy(self) -> Table:
+        """[S, A]; None is uniform."""
+
+    @property
+    def averages_exp_reward(self) -> bool:
+        """Whether noise in r counts as reward."""
+
+    @property
+    def drawn_from_prior(self) -> str:
+        """The column that must be draws from the prior policy: "a", "a_next" or ""."""
+
+    def init(self, n_states: int, n_actions: int) -> S:
+        """``start``, of these sizes."""
+
+
+class Streaming(ABC, Generic[T, Prepared]):
+    """A learner that streams tuples in epochs: a subclass has ``init``, ``prepare``, ``step``, ``finished`` and
+    ``solution``."""
+
+    unit: ClassVar[str] = "tuples"
+    needs_model: ClassVar[bool] = False
+    states: ClassVar[tuple[type, ...]] = ()
+    stream_bytes: ClassVar[int] = 40  # memory of a tuple in ``prepare``d experience
+
+    beta: float
+    prior_policy: Table
+
+    @property
+    def averages_exp_reward(self) -> bool:
+        return False
+
+    @property
+    def drawn_from_prior(self) -> str:
+        return ""
+
+    @property
+    def passes(self) -> int:
+        """Over the experience, at most."""
+        return 1
+
+    @abstractmethod
+    def init(self, n_states: int, n_actions: int) -> T:
+        """The state before any tuple: its policy is the prior. Raises InputError for a prior of other sizes."""
+
+    @abstractmethod
+    def prepare(self, transitions: Experience, n_states: int, n_actions: int) -> Prepared:
+        """What is the same in every epoch, found once. Raises InputError for tuples out of range."""
+
+    @abstractmethod
+    def step(self, state: T, stream: Prepared) -> T:
+        """The state after one more epoch. Pure: ``state`` is left as it is. Raises NonFiniteError."""
+
+    @abstractmethod
+    def finished(self, state: T) -> bool:
+        """Whether no epoch follows."""
+
+    @abstractmethod
+    def solution(
+        self, state: T, history: Sequence[Mapping[str, float]] = (), failure: BaseException | None = None
+    ) -> Solution:
+        """What ``state`` stands for; ``history`` holds one ``metrics()`` per epoch, ``failure`` is what ended it."""
+
+    def fit(self, transitions: Experience, n_states: int, n_actions: int) -> Solution:
+        """Run to the end and return the solution.
+
+        A run that leaves the finite numbers ends with ``Status.NON_FINITE``, the tables of the last good epoch and a
+        message with step and cause.
+
+        Raises:
+            InputError: a state or action out of range, or a prior policy of the wrong shape.
+        """
+        state = self.init(n_states, n_actions)
+        history: list[Mapping[str, float]] = []
+        failure: NonFiniteError | None = None
+        try:
+            for state in self.iterate(transitions, n_states, n_actions):
+                history.append(state.metrics())
+        except NonFiniteError as error:
+            failure = error
+        return self.solution(state, history, failure)
+
+    def iterate(self, transitions: Experience, n_states: int, n_actions: int, state: T | None = None) -> Iterator[T]:
+        """Yield the state after each epoch, from ``state`` on, until it is ``finished``.
+
+        The caller may log it, save it, or stop. Raises what ``prepare`` and ``step`` raise; the state yielded last is
+        then still good.
+        """
+        checks.instance("transitions", transitions, Experience, "a recording, as of Transitions or open_recording")
+        stream = self.prepare(transitions, n_states, n_actions)
+        state = self.init(n_states, n_actions) if state is None else state
+        while not self.finished(state):
+            state = self.step(state, stream)
+            yield state
+
+    def start(self, problem: Problem) -> T:
+        """``init``, with the sizes of ``problem``."""
+        return self.init(problem.n_states, problem.n_actions)
+
+    def run(self, problem: Problem, experience: Experience | None, state: T | None = None) -> Iterator[T]:
+        """``iterate``, with the sizes of ``problem``."""
+        assert experience is not None
+        return self.iterate(experience, problem.n_states, problem.n_actions, state)
+
+    def position(self, state: T) -> int:
+        """Tuples streamed so far."""
+        return state.n_tuples
+
+    def work(self, state: T) -> int:
+        """Tuples streamed so far."""
+        return state.n_tuples
+
+    def total(self, experience: Experience | None) -> int | None:
+        """Tuples to stream, at most."""
+        return None if experience is None else self.passes * len(experience)
+
+    def milestone(self, state: T) -> str:
+        """``last pass`` once ``finished``."""
+        return "last pass" if self.finished(state) else ""
+
+    def progress(self, state: T) -> str:
+        """Epoch and theta."""
+        return f"epoch {state.epoch}" + ("" if state.theta is None else f" theta {state.theta:.4f}")
+
+    def ended(self, state: T, failure: BaseException | None) -> Status:
+        """NON_FINITE, STOPPED or COMPLETED."""
+        if isinstance(failure, NonFiniteError):
+            return Status.NON_FINITE
+        return Status.COMPLETED if self.finished(state) else Status.STOPPED
+
+
+def message(failure: BaseException | None) -> str:
+    """What a solution says of ``failure``: a run that was stopped has nothing to say."""
+    return str(failure) if isinstance(failure, NonFiniteError) else ""
 
 
 def columns(rows: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
-    """Rows of numbers (or arrays) with the same names, as one array a name."""
+    """Rows of numbers (or arrays) with the same names, as one array per name."""
     return {name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())}
-
-
-def run_to_end(learner: Any, transitions: Experience, n_states: int, n_actions: int) -> Solution:
-    """The solution of the last good state of ``learner.iterate``, with one ``metrics()`` of history for each."""
-    state = learner.init(n_states, n_actions)
-    history: list[dict[str, float]] = []
-    failure: NonFiniteError | None = None
-    try:
-        for state in learner.iterate(transitions, n_states, n_actions):
-            history.append(state.metrics())
-    except NonFiniteError as error:
-        failure = error
-    solution: Solution = learner.solution(state, history, failure)
-    return solution

@@ -24,24 +24,23 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 import torch
 
 from erl_torch import checks
 from erl_torch.checks import InputError
-from erl_torch.experience.simulation import ReplicaExperience, Simulation, fits, tuples_of
+from erl_torch.experience.simulation import ReplicaExperience, Simulation, fits, streams_of, tuples_of
 from erl_torch.experience.transitions import Transitions
 from erl_torch.files import read_npz, write_npz
-from erl_torch.learners.learner import NonFiniteError, columns
+from erl_torch.learners.learner import NonFiniteError, Streaming, columns
 from erl_torch.learners.s1.algorithm import AlgorithmS1
-from erl_torch.learners.s1.lanes import can_interleave, interleave
+from erl_torch.learners.s1.lanes import LanesState, can_interleave, interleave
 from erl_torch.learners.together import Together, check_learner
 from erl_torch.mdp.tabular import check_policy
+from erl_torch.problem import Problem
 from erl_torch.solution import Solution
-
-STREAM_BYTES = 40  # a tuple in the prepared stream of a learner that does not say: columns and pairs
 
 
 class ReplicaState(Protocol):
@@ -50,6 +49,10 @@ class ReplicaState(Protocol):
     @property
     def n_tuples(self) -> int:
         """Tuples that each replica has streamed so far, those that stopped early excepted."""
+
+    @property
+    def work(self) -> int:
+        """Tuples that all replicas have streamed so far, together."""
 
     @property
     def failures(self) -> Mapping[int, NonFiniteError]:
@@ -61,6 +64,9 @@ class ReplicaState(Protocol):
 
     def replica(self, r: int) -> Any:
         """The state of one replica, as its own learner would have it."""
+
+    def milestone(self, learners: Sequence[Streaming[Any, Any]]) -> str:
+        """The milestone of the replicas that reached one in the last epoch; "" if none did."""
 
     def metrics(self) -> dict[str, np.ndarray]:
         """``metrics()`` of every replica, [R] each."""
@@ -128,6 +134,9 @@ class Replicas(Together):
         InputError: an argument out of its range.
     """
 
+    unit: ClassVar[str] = "tuples"
+    needs_model: ClassVar[bool] = False
+
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.backend == "torch" and not isinstance(self.learners[0], AlgorithmS1):
@@ -178,8 +187,52 @@ class Replicas(Together):
         run = interleave if can_interleave(self, experience) else each
         return run(self, experience, n_states, n_actions, state)
 
-    def solution(self, state: ReplicaState, history: Sequence[dict[str, np.ndarray]] = ()) -> ReplicaSolution:
-        """The solutions that ``state`` stands for; ``history`` holds one ``metrics()`` an epoch."""
+    @property
+    def states(self) -> tuple[type, ...]:
+        """Classes that the state of all is made of."""
+        return (EachState, LanesState, *self.learners[0].states)
+
+    def start(self, problem: Problem) -> EachState:
+        """The state of all before any tuple. Raises InputError as each learner does."""
+        return EachState(tuple(learner.start(problem) for learner in self.learners), {})
+
+    def run(
+        self, problem: Problem, experience: ReplicaExperience | None, state: ReplicaState | None = None
+    ) -> Iterator[ReplicaState]:
+        """``iterate``, with the sizes of ``problem``."""
+        assert experience is not None
+        return self.iterate(experience, problem.n_states, problem.n_actions, state)
+
+    def position(self, state: ReplicaState) -> int:
+        """Tuples that each replica has streamed so far."""
+        return state.n_tuples
+
+    def work(self, state: ReplicaState) -> int:
+        """Tuples that all replicas have streamed so far, together."""
+        return state.work
+
+    def total(self, experience: ReplicaExperience | None) -> int | None:
+        """Tuples to stream, at most, in all replicas together."""
+        if experience is None:
+            return None
+        longest = experience.n_tuples if isinstance(experience, Simulation) else max(map(len, streams_of(experience)))
+        return self.learners[0].passes * longest * len(self)
+
+    def milestone(self, state: ReplicaState) -> str:
+        """That of the replicas that reached one in the last epoch; of several, the furthest's."""
+        return state.milestone(self.learners)
+
+    def progress(self, state: ReplicaState) -> str:
+        """Nothing: the bar counts the tuples of all."""
+        return ""
+
+    def solution(
+        self,
+        state: ReplicaState,
+        history: Sequence[Mapping[str, np.ndarray]] = (),
+        failure: BaseException | None = None,
+    ) -> ReplicaSolution:
+        """The solutions that ``state`` stands for; ``failure`` is what ended all of them."""
         solutions = []
         for r, learner in enumerate(self.learners):
             own = state.replica(r)
@@ -188,7 +241,7 @@ class Replicas(Together):
                 if row["n_tuples"][r] == (rows[-1]["n_tuples"] if rows else 0):
                     break  # it had stopped before
                 rows.append({name: values[r].item() for name, values in row.items()})
-            solutions.append(learner.solution(own, rows, state.failures.get(r)))
+            solutions.append(learner.solution(own, rows, state.failures.get(r, failure)))
         return ReplicaSolution(tuple(solutions), state.failures)
 
     def _check(self, experience: ReplicaExperience, n_states: int, n_actions: int) -> None:
@@ -225,10 +278,15 @@ class EachState:
 
     states: tuple[Any, ...]
     failures: Mapping[int, NonFiniteError]
+    stepped: tuple[int, ...] = ()  # the replicas that this epoch was of
 
     @property
     def n_tuples(self) -> int:
         return max(int(state.n_tuples) for state in self.states)
+
+    @property
+    def work(self) -> int:
+        return sum(int(state.n_tuples) for state in self.states)
 
     @property
     def policy(self) -> torch.Tensor:
@@ -236,6 +294,11 @@ class EachState:
 
     def replica(self, r: int) -> Any:
         return self.states[r]
+
+    def milestone(self, learners: Sequence[Streaming[Any, Any]]) -> str:
+        ended = [r for r in self.stepped if r not in self.failures and learners[r].milestone(self.states[r])]
+        furthest = max(ended, key=lambda r: self.states[r].n_tuples, default=None)
+        return "" if furthest is None else learners[furthest].milestone(self.states[furthest])
 
     def metrics(self) -> dict[str, np.ndarray]:
         return columns([state.metrics() for state in self.states])
@@ -247,7 +310,7 @@ def each(
     """``Replicas.iterate`` of any learner that streams. Prepared streams are held where they fit, else made again."""
     learners, prior = replicas.learners, replicas.prior_policy(n_states, n_actions)
     held: list[Any] = [None] * len(replicas)
-    hold = fits(experience, len(replicas), getattr(learners[0], "stream_bytes", STREAM_BYTES))
+    hold = fits(experience, len(replicas), learners[0].stream_bytes)
     states = list(state.states) if state else [learner.init(n_states, n_actions) for learner in learners]
     failures = dict(state.failures) if state else {}
 
@@ -268,4 +331,4 @@ def each(
                     failures[r] = after
                 else:
                     states[r] = after
-            yield EachState(tuple(states), dict(failures))
+            yield EachState(tuple(states), dict(failures), tuple(live))

@@ -10,6 +10,7 @@ import numpy as np
 
 from erl_torch import checks
 from erl_torch.checks import InputError
+from erl_torch.learners.learner import Streaming
 from erl_torch.mdp.tabular import check_policy
 
 
@@ -17,7 +18,7 @@ from erl_torch.mdp.tabular import check_policy
 class Together:
     """Learners of one class and one prior policy, side by side; arguments as of ``Replicas``."""
 
-    learners: tuple[Any, ...]
+    learners: tuple[Streaming[Any, Any], ...]
     threads: int | None = None
     block: int | None = None
     layout: str = "auto"
@@ -50,6 +51,6 @@ class Together:
         return check_policy("prior_policy", self.learners[0].prior_policy, n_states, n_actions)
 
 
-def check_learner(key: str, learner: Any) -> None:
-    if not is_dataclass(learner) or isinstance(learner, type) or not hasattr(learner, "fit"):
-        raise InputError(key, f"{learner} ({type(learner).__name__})", "a learner that has fit, as AlgorithmS1()")
+def check_learner(key: str, learner: object) -> None:
+    if not isinstance(learner, Streaming) or not is_dataclass(learner):
+        raise InputError(key, f"{learner} ({type(learner).__name__})", "a learner that streams, as AlgorithmS1()")

@@ -147,7 +147,7 @@ class Board:
         mark: Mark | None = None,
     ) -> None:
         self._file = EventFile(directory, mark)
-        self._directory = Path(directory)
+        self.directory = Path(directory)
         self._lines: dict[str, float] = {}
         # Session start and end go into the run's own file: add_hparams would open a run directory more.
         # No experiment summary: TensorBoard takes the first it finds and hides other runs' columns.
@@ -175,11 +175,11 @@ class Board:
         """An image [H, W, 3] uint8."""
         self._file.add(summary.image(tag, pixels, dataformats="HWC"), step)  # type: ignore[no-untyped-call]
 
-    def texts(self, cfg: DictConfig) -> None:
-        """The resolved configuration and the command behind the run."""
-        texts = {"configuration": f"```yaml\n{OmegaConf.to_yaml(cfg, resolve=True)}```"}
+    def texts(self, configuration: str) -> None:
+        """The resolved configuration (YAML) and the command behind the run."""
+        texts = {"configuration": f"```yaml\n{configuration}```"}
         try:
-            typed = command(self._directory)
+            typed = command(self.directory)
         except InputError as error:
             typed = None
             print(f"warning: the log does without the command behind the run ({error})", file=sys.stderr)

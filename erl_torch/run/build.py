@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import gymnasium as gym
-import numpy as np
 from gymnasium.envs.registration import EnvSpec, load_env_creator
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
@@ -159,18 +158,11 @@ def _control_world(cfg: DictConfig, env: gym.Env[Any, Any], safe_point: SafePoin
     return World(TabularMDP(mdp.transition, mdp.reward), mdp)
 
 
-def episode_model(env: gym.Env[Any, Any], world: World) -> TabularMDP | None:
-    """The model whose rewards over the horizon are an episode's return; None where there is none."""
-    endless = known_mdp(env) is not None and not getattr(env.unwrapped, "ends", np.zeros(1)).any()
-    return world.episode or (world.mdp if endless else None)
-
-
-def make_problem(cfg: DictConfig, env: gym.Env[Any, Any], learner: Any, safe_point: SafePoint) -> Problem:
+def make_problem(cfg: DictConfig, env: gym.Env[Any, Any], world: World, learner: Any) -> Problem:
     """What there is to learn in ``env`` as the run ``cfg`` says, with the prior of ``learner``. Raises InputError."""
-    world = make_world(cfg.env, env, safe_point)
     prior = check_policy("learner.prior_policy", learner.prior_policy, *sizes(env))
     horizon = min(cfg.evaluation.horizon, (env.spec and env.spec.max_episode_steps) or cfg.evaluation.horizon)
-    return Problem(env, world.source, prior, world.mdp, world.episode, horizon)
+    return Problem(env, world.source, prior, world.mdp, world.episode, horizon, cfg.env.name)
 
 
 def learner_class(cfg: DictConfig, key: str = "learner") -> Any:
@@ -293,10 +285,3 @@ def _collecting(what: str, total: int | None, safe_point: SafePoint) -> Iterator
             safe_point()
 
         yield report
-
-
-def check_evaluation(cfg: DictConfig) -> None:
-    with group("evaluation"):
-        for key in ("every", "n_episodes", "horizon", "exact_up_to"):
-            checks.at_least(key, cfg[key], 1)
-        checks.memory("n_episodes", cfg.n_episodes, 8 * cfg.n_episodes, "the returns of all episodes")

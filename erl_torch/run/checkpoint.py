@@ -16,8 +16,9 @@ import pickle
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
+from enum import Enum
 from pathlib import Path
 from typing import Any
 
@@ -25,16 +26,19 @@ import numpy as np
 import torch
 
 from erl_torch.checks import InputError, out_of_memory
+from erl_torch.evaluation import Evaluation
 from erl_torch.files import read_json, write_bytes, write_json
-from erl_torch.learners import states
+from erl_torch.learners.learner import NonFiniteError
 from erl_torch.log.event_file import PATTERN
+from erl_torch.solution import Solution, Status
 
 FORMAT = 2  # 1 knew no settings
 KEPT = 2
 RESULTS = ("result.json", "solution.npz", "replicas.npz")
 FILES = ("settings.json", *RESULTS, "bands.png", "sweep.png")  # that a run writes under names of its own
 FREE = ("threads", "checkpoint_every")  # settings that no result depends on
-CLASSES: dict[str, Any] = {one.__name__: one for one in states()}
+COMMON = (Evaluation, NonFiniteError, Solution, Status)  # classes that any checkpoint may hold
+Content = dict[str, Any]
 
 
 class Checkpoints:
@@ -66,12 +70,12 @@ class Checkpoints:
         if before is not None:
             self._compare(before)
 
-    def start(self) -> dict[str, Any] | None:
+    def start(self, classes: Iterable[type] = ()) -> Content | None:
         """Take possession of the directory (leftovers of a killed run go), and ``read``; None: the run begins.
 
         Raises InputError as ``read``; the directory is then as it was.
         """
-        found = self.read()
+        found = self.read(classes)
         write_json(self.directory / "settings.json", self._settings)
         for leftover in (*self.directory.glob(".*.tmp"), *self._folder.glob(".*.tmp")):
             leftover.unlink(missing_ok=True)
@@ -81,8 +85,11 @@ class Checkpoints:
         self._others = set(self.directory.glob(PATTERN))
         return found
 
-    def read(self) -> dict[str, Any] | None:
+    def read(self, classes: Iterable[type] = ()) -> Content | None:
         """The newest checkpoint that can be read; damaged ones go, with a warning.
+
+        Args:
+            classes: what states in it may be made of, beside ``COMMON``: nothing else is made of what a file names.
 
         Raises InputError for one of other settings, or one that is whole but of another version of the program.
         """
@@ -97,7 +104,7 @@ class Checkpoints:
             try:
                 settings, content = _loaded(body)
                 self._compare(settings)
-                found: dict[str, Any] = decode(content, self.device)
+                found: Content = decode(content, (*COMMON, *classes), self.device)
             except (AttributeError, KeyError, TypeError, ValueError, RuntimeError, pickle.UnpicklingError) as error:
                 if isinstance(error, InputError) or out_of_memory(error):
                     raise
@@ -183,33 +190,38 @@ def encode(value: Any) -> Any:
         return [encode(item) for item in value]
     if isinstance(value, np.generic):
         return value.item()
-    if hasattr(value, "name") and type(value).__name__ in CLASSES:  # an enumeration
+    if isinstance(value, Enum):
         return {"class": type(value).__name__, "member": value.name}
     return value.detach().cpu() if isinstance(value, torch.Tensor) else value
 
 
-def decode(value: Any, device: str = "cpu") -> Any:
-    """What ``encode`` was given. Raises ValueError for a class that no state is made of."""
-    if isinstance(value, list):
-        return [decode(item, device) for item in value]
-    if isinstance(value, torch.Tensor):
-        return value.to(device)
-    if not isinstance(value, dict):
-        return value
-    kind = value["class"]
-    if kind == "array":
-        return value["value"].numpy()
-    if kind == "dict":
-        return {decode(k, device): decode(v, device) for k, v in value["items"]}
-    if kind == "tuple":
-        return tuple(decode(item, device) for item in value["items"])
-    if kind not in CLASSES:
-        raise ValueError(f"unknown class {kind}")
-    if "arguments" in value:
-        return CLASSES[kind](*value["arguments"])
-    if "member" in value:
-        return CLASSES[kind][value["member"]]
-    return CLASSES[kind](**{name: decode(item, device) for name, item in value.items() if name != "class"})
+def decode(value: Any, classes: Iterable[type], device: str = "cpu") -> Any:
+    """What ``encode`` was given. Raises ValueError for a class that is not one of ``classes``."""
+    by_name: dict[str, Any] = {one.__name__: one for one in classes}
+
+    def decoded(value: Any) -> Any:
+        if isinstance(value, list):
+            return [decoded(item) for item in value]
+        if isinstance(value, torch.Tensor):
+            return value.to(device)
+        if not isinstance(value, dict):
+            return value
+        kind = value["class"]
+        if kind == "array":
+            return value["value"].numpy()
+        if kind == "dict":
+            return {decoded(k): decoded(v) for k, v in value["items"]}
+        if kind == "tuple":
+            return tuple(decoded(item) for item in value["items"])
+        if kind not in by_name:
+            raise ValueError(f"unknown class {kind}")
+        if "arguments" in value:
+            return by_name[kind](*value["arguments"])
+        if "member" in value:
+            return by_name[kind][value["member"]]
+        return by_name[kind](**{name: decoded(item) for name, item in value.items() if name != "class"})
+
+    return decoded(value)
 
 
 def _write(path: Path, settings: Mapping[str, Any], content: Any) -> None:

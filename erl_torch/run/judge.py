@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
+from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.empirical.counts import EmpiricalMDP
 from erl_torch.empirical.uncertainty import Estimate, theta_uncertainty
+from erl_torch.mdp.from_gymnasium import ending_states, known_mdp
+from erl_torch.mdp.tabular import TabularMDP
+from erl_torch.notes import note
+from erl_torch.problem import Problem
 from erl_torch.solvers.chains import SingularChainError
 
 SMALL = 2000  # states of a model, or that a stream meets, up to which it is solved beside every run
@@ -26,3 +33,49 @@ def of_data(model: EmpiricalMDP | None, beta: float, prior: np.ndarray) -> Estim
         except (SingularChainError, np.linalg.LinAlgError):
             reason = "the chain of the data falls apart in double precision"
     return Estimate("theta", np.nan, np.inf, withheld=reason)
+
+
+@dataclass(frozen=True)
+class EvaluationSettings:
+    """What is measured of a policy while it learns.
+
+    Args:
+        every: epochs between records, >= 1; milestones and ends are always recorded.
+        n_episodes: episodes behind ``eval/return``, >= 1.
+        horizon: steps of an evaluated episode, >= 1.
+        certify: where the model is known, solve it for the gap of the learnt policy.
+        pictures: of policy and reward bias, after each milestone.
+        exact_up_to: transitions of a model that figures are exact for, >= 1; beyond, episodes are played.
+
+    Raises:
+        InputError: an argument out of its range.
+    """
+
+    every: int = 1
+    n_episodes: int = 20
+    horizon: int = 1000
+    certify: bool = True
+    pictures: bool = True
+    exact_up_to: int = 1_000_000
+
+    def __post_init__(self) -> None:
+        for key in ("every", "n_episodes", "horizon", "exact_up_to"):
+            checks.at_least(key, getattr(self, key), 1)
+        checks.flag("certify", self.certify)
+        checks.flag("pictures", self.pictures)
+        checks.memory("n_episodes", self.n_episodes, 8 * self.n_episodes, "the returns of all episodes")
+
+
+def judging_model(problem: Problem, settings: EvaluationSettings) -> TabularMDP | None:
+    """The model that policies of ``problem`` are judged by; None, with a note, where it is large."""
+    if problem.mdp is None or problem.mdp.transition.nnz <= settings.exact_up_to:
+        return problem.mdp
+    note("a large model (evaluation.exact_up_to): episodes are played instead")
+    return None
+
+
+def episode_model(problem: Problem) -> TabularMDP | None:
+    """The model whose rewards over the horizon are an episode's return; None where there is none."""
+    env = problem.env
+    endless = known_mdp(env) is not None and not ending_states(env, problem.n_states).any()
+    return problem.episode or (problem.mdp if endless else None)

@@ -30,7 +30,7 @@ Steps need 1/2 < power <= 1 to converge; near 1 they forget too slowly what earl
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -42,9 +42,9 @@ from erl_torch.checks import InputError
 from erl_torch.experience.experience import Experience, Parts
 from erl_torch.experience.transitions import Transitions
 from erl_torch.learners.action_value import kernels
-from erl_torch.learners.learner import NonFiniteError, columns, epochs, run_to_end
+from erl_torch.learners.learner import NonFiniteError, Streaming, columns, message
 from erl_torch.mdp.tabular import check_prior
-from erl_torch.solution import Solution, Status
+from erl_torch.solution import Solution
 
 BLOCK = 1 << 22  # tuples a compiled call, so that signals are served several times a second
 LARGEST = 1e300  # of beta |q|: differences must stay finite
@@ -62,6 +62,8 @@ class ActionValueState:
     q: torch.Tensor  # [S, A], reward
     visits: torch.Tensor  # [S, A] int64
     rate: float | None  # g, reward a step; None where none is estimated
+
+    reward_bias: ClassVar[None] = None
 
     @property
     def action_value(self) -> torch.Tensor:
@@ -103,7 +105,7 @@ class ActionValueStream:
 
 
 @dataclass(frozen=True, eq=False)
-class ActionValueLearner:
+class ActionValueLearner(Streaming[ActionValueState, ActionValueStream]):
     """What the learners of action values share; see the module's docstring.
 
     Args:
@@ -116,7 +118,8 @@ class ActionValueLearner:
         InputError: an argument out of its range.
     """
 
-    stream_bytes: ClassVar[int] = 28  # a tuple in a prepared stream: columns, pairs
+    states: ClassVar[tuple[type, ...]] = (ActionValueState,)
+    stream_bytes: ClassVar[int] = 28  # columns, pairs
 
     beta: float = 10.0
     power: float = 0.6
@@ -125,7 +128,6 @@ class ActionValueLearner:
 
     backup: ClassVar[int] = SOFT
     exponential: ClassVar[bool] = False
-    drawn_from_prior: ClassVar[str] = ""
 
     @property
     def averages_exp_reward(self) -> bool:
@@ -138,40 +140,31 @@ class ActionValueLearner:
             raise InputError("power", self.power, "a number in (0.5, 1]")
         checks.at_least("n_epochs", self.n_epochs, 1)
 
-    def fit(self, transitions: Experience, n_states: int, n_actions: int) -> Solution:
-        """Run to the end and return the solution; Status.NON_FINITE with the last good pass if a table overflows.
-
-        Raises InputError: a state or action out of range, or a prior policy of the wrong shape.
-        """
-        return run_to_end(self, transitions, n_states, n_actions)
-
-    def iterate(
-        self, transitions: Experience, n_states: int, n_actions: int, state: ActionValueState | None = None
-    ) -> Iterator[ActionValueState]:
-        """Yield the state after each pass, n_epochs times. Raises NonFiniteError."""
-        yield from epochs(self, transitions, n_states, n_actions, state)
-
     def finished(self, state: ActionValueState) -> bool:
         """After the last pass."""
         return state.epoch == self.n_epochs
 
+    @property
+    def passes(self) -> int:
+        """n_epochs."""
+        return self.n_epochs
+
     def solution(
         self,
         state: ActionValueState,
-        history: list[dict[str, float]] | None = None,
-        failure: NonFiniteError | None = None,
+        history: Sequence[Mapping[str, float]] = (),
+        failure: BaseException | None = None,
     ) -> Solution:
-        """The solution that ``state`` stands for; ``history`` holds one ``metrics()`` a pass."""
-        ended = Status.COMPLETED if self.finished(state) else Status.STOPPED
+        """The solution that ``state`` stands for."""
         return Solution.of_action_values(
             state.action_value,
             state.prior_policy,
             self.beta,
             state.theta,
             n_steps=state.n_tuples,
-            status=ended if failure is None else Status.NON_FINITE,
-            message=str(failure) if failure else "",
-            history=columns(history or []),
+            status=self.ended(state, failure),
+            message=message(failure),
+            history=columns(history),
         )
 
     def init(self, n_states: int, n_actions: int) -> ActionValueState:

@@ -48,6 +48,7 @@ class ZLearning(_Average):
 
     exponential: ClassVar[bool] = True
     drawn_from_prior: ClassVar[str] = "a"
+    states: ClassVar[tuple[type, ...]] = (ZState,)
 
     def init(self, n_states: int, n_actions: int) -> ZState:
         start = super().init(n_states, n_actions)

@@ -71,7 +71,7 @@ Q-learning (Abounadi, Bertsekas, Borkar 2001), 6 Polyak and Juditsky (1992).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar
 
@@ -86,7 +86,7 @@ from erl_torch.empirical.counts import EmpiricalMDP, EmpiricalProblem, empirical
 from erl_torch.experience.experience import Experience, Parts, Selection
 from erl_torch.experience.transitions import Transitions
 from erl_torch.learners.efficient_s1 import kernels
-from erl_torch.learners.learner import NonFiniteError, columns, epochs, run_to_end
+from erl_torch.learners.learner import NonFiniteError, Streaming, columns, message
 from erl_torch.learners.s1.algorithm import BLOCK, LOG_PSI_EPSILON
 from erl_torch.mdp.tabular import check_prior
 from erl_torch.solution import Solution, Status, proven
@@ -279,7 +279,7 @@ class EfficientStream:
 
 
 @dataclass(frozen=True, eq=False)
-class EfficientS1:
+class EfficientS1(Streaming[EfficientState, EfficientStream]):
     """Algorithm S1 with options that reach certainty equivalence; see the module's docstring.
 
     Args:
@@ -300,7 +300,8 @@ class EfficientS1:
         InputError: an argument out of its range.
     """
 
-    stream_bytes: ClassVar[int] = 8  # a tuple in a prepared stream: pairs
+    states: ClassVar[tuple[type, ...]] = (EfficientState,)
+    stream_bytes: ClassVar[int] = 8  # pairs
 
     beta: float = 10.0
     lr_u: float = 0.005
@@ -360,8 +361,6 @@ class EfficientS1:
     def drawn_from_prior(self) -> str:
         return "" if self.expected_backup else "a_next"
 
-    # -- the whole run ------------------------------------------------------------------------------
-
     def fit(self, transitions: Experience, n_states: int, n_actions: int) -> Solution:
         """Run to the end and return the solution.
 
@@ -374,35 +373,41 @@ class EfficientS1:
             InputError: a state or action out of range, a prior policy of the wrong shape, or a stream that never
                 returns to any state.
         """
-        return run_to_end(self, transitions, n_states, n_actions)
-
-    def iterate(
-        self, transitions: Experience, n_states: int, n_actions: int, state: EfficientState | None = None
-    ) -> Iterator[EfficientState]:
-        """Yield the state after each epoch: n_bias * n_epochs times, or until certified."""
-        yield from epochs(self, transitions, n_states, n_actions, state)
+        return super().fit(transitions, n_states, n_actions)
 
     def finished(self, state: EfficientState) -> bool:
         """Certified, or after the last epoch of the last biasing iteration."""
         return state.certified or (state.bias_iteration, state.epoch) == (self.n_bias - 1, self.n_epochs)
 
+    @property
+    def passes(self) -> int:
+        """n_bias * n_epochs."""
+        return self.n_bias * self.n_epochs
+
+    def milestone(self, state: EfficientState) -> str:
+        """The end of a biasing iteration."""
+        return "" if state.epoch < self.n_epochs else f"biasing iteration {state.bias_iteration}"
+
+    def progress(self, state: EfficientState) -> str:
+        """Biasing iteration, epoch and theta."""
+        return f"bias {state.bias_iteration}/{self.n_bias - 1} {super().progress(state)}"
+
     def solution(
         self,
         state: EfficientState,
-        history: list[dict[str, float]] | None = None,
-        failure: ArithmeticError | None = None,
+        history: Sequence[Mapping[str, float]] = (),
+        failure: BaseException | None = None,
     ) -> Solution:
-        """The solution that ``state`` stands for; ``history`` holds one ``metrics()`` an epoch."""
-        if failure is not None:
-            status = Status.NON_FINITE
+        """The solution that ``state`` stands for; its status as ``fit`` says."""
+        status = self.ended(state, failure)
+        if status is Status.NON_FINITE:
+            pass
         elif state.status is not None and (isinstance(state, OnlineState) or self.finished(state)):
             status = state.status
         elif state.certified:
             status = Status.CONVERGED
-        elif not self.finished(state):
-            status = Status.STOPPED
-        else:
-            status = Status.COMPLETED if state.psi_converged else Status.PSI_LIMIT
+        elif status is Status.COMPLETED and not state.psi_converged:
+            status = Status.PSI_LIMIT
         return Solution(
             policy=state.policy,
             u=state.u,
@@ -413,9 +418,9 @@ class EfficientS1:
             reward_bias_max=state.reward_bias_max,
             n_steps=state.n_tuples,
             status=status,
-            message=str(failure) if failure else state.message,
+            message=message(failure) or state.message,
             beta=self.beta,
-            history=columns(history or []),
+            history=columns(history),
         )
 
     def online(
@@ -442,8 +447,6 @@ class EfficientS1:
         for chunk in chunks:
             state = self.learn(state, chunk)
             yield state
-
-    # -- its parts, for callers that keep the state themselves --------------------------------------
 
     def init(self, n_states: int, n_actions: int) -> EfficientState:
         """The state before any tuple: the prior policy, rho = exp(-beta), no bias."""

@@ -63,7 +63,7 @@ which made the published Figure 5; ``ListedS1`` is the same class with the listi
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -75,7 +75,7 @@ from erl_torch.checks import InputError
 from erl_torch.empirical.counts import tally
 from erl_torch.experience.experience import Experience, Parts, tuple_at
 from erl_torch.experience.transitions import Transitions
-from erl_torch.learners.learner import NonFiniteError, columns, epochs, run_to_end
+from erl_torch.learners.learner import NonFiniteError, Streaming, columns, message
 from erl_torch.learners.s1 import kernels, listing
 from erl_torch.mdp.tabular import check_prior
 from erl_torch.solution import Solution, Status
@@ -173,7 +173,7 @@ class S1Stream:
 
 
 @dataclass(frozen=True, eq=False)
-class AlgorithmS1:
+class AlgorithmS1(Streaming[S1State, S1Stream]):
     """Algorithm S1, every line of the listing; see the module's docstring for symbols and open points.
 
     Args:
@@ -196,7 +196,8 @@ class AlgorithmS1:
         InputError: an argument out of its range.
     """
 
-    stream_bytes: ClassVar[int] = 32  # a tuple in a prepared stream: columns, pairs
+    states: ClassVar[tuple[type, ...]] = (S1State,)
+    stream_bytes: ClassVar[int] = 32  # columns, pairs
     averages_exp_reward: ClassVar[bool] = True
     drawn_from_prior: ClassVar[str] = "a_next"
 
@@ -236,46 +237,33 @@ class AlgorithmS1:
         checks.one_of("implementation", self.implementation, ("fast", "literal"))
         checks.device("device", self.device)
 
-    # -- the whole run ------------------------------------------------------------------------------
-
-    def fit(self, transitions: Experience, n_states: int, n_actions: int) -> Solution:
-        """Run to the end and return the solution.
-
-        A run that leaves the finite numbers ends with ``Status.NON_FINITE``, the tables of the last good
-        epoch and a message with step and cause.
-
-        Raises:
-            InputError: a state or action out of range, or a prior policy of the wrong shape.
-        """
-        return run_to_end(self, transitions, n_states, n_actions)
-
-    def iterate(
-        self, transitions: Experience, n_states: int, n_actions: int, state: S1State | None = None
-    ) -> Iterator[S1State]:
-        """Yield the state after each epoch of the u phase: n_bias * n_epochs times, or what is left after ``state``.
-
-        The caller may log it, save it, or stop. Raises NonFiniteError with step and cause; the state
-        yielded last is then still good.
-        """
-        yield from epochs(self, transitions, n_states, n_actions, state)
-
     def finished(self, state: S1State) -> bool:
         """After the last epoch of the last biasing iteration."""
         return (state.bias_iteration, state.epoch) == (self.n_bias - 1, self.n_epochs)
 
+    @property
+    def passes(self) -> int:
+        """n_bias * n_epochs."""
+        return self.n_bias * self.n_epochs
+
+    def milestone(self, state: S1State) -> str:
+        """The end of a biasing iteration."""
+        return "" if state.epoch < self.n_epochs else f"biasing iteration {state.bias_iteration}"
+
+    def progress(self, state: S1State) -> str:
+        """Biasing iteration, epoch and theta."""
+        return f"bias {state.bias_iteration}/{self.n_bias - 1} {super().progress(state)}"
+
     def solution(
         self,
         state: S1State,
-        history: list[dict[str, float]] | None = None,
-        failure: NonFiniteError | None = None,
+        history: Sequence[Mapping[str, float]] = (),
+        failure: BaseException | None = None,
     ) -> Solution:
-        """The solution that ``state`` stands for; ``history`` holds one ``metrics()`` an epoch."""
-        if failure is not None:
-            status = Status.NON_FINITE
-        elif not self.finished(state):
-            status = Status.STOPPED
-        else:
-            status = Status.COMPLETED if state.psi_converged else Status.PSI_LIMIT
+        """The solution that ``state`` stands for; PSI_LIMIT where a psi phase met ``max_psi_epochs``."""
+        status = self.ended(state, failure)
+        if status is Status.COMPLETED and not state.psi_converged:
+            status = Status.PSI_LIMIT
         return Solution(
             policy=state.policy,
             u=state.u,
@@ -286,12 +274,10 @@ class AlgorithmS1:
             reward_bias_max=state.reward_bias_max,
             n_steps=state.n_tuples,
             status=status,
-            message=str(failure) if failure else "",
+            message=message(failure),
             beta=self.beta,
-            history=columns(history or []),
+            history=columns(history),
         )
-
-    # -- its parts, for callers that keep the state themselves --------------------------------------
 
     def init(self, n_states: int, n_actions: int) -> S1State:
         """The state before any tuple (line 1): the prior policy, rho = exp(-beta), no bias."""

@@ -14,6 +14,7 @@ Pair index: ``k = s * n_actions + a``. Transition matrices come as CSR arrays (i
 from __future__ import annotations
 
 import math
+from fractions import Fraction
 from pathlib import Path
 
 import numba
@@ -21,13 +22,13 @@ import numpy as np
 from numba.extending import intrinsic
 
 # Numba looks at this file alone to see whether it has changed: the other's checksum changes it.
-# experience/kernels.py: 324154407
+# experience/kernels.py: 1519040632
 from erl_torch.experience.kernels import sample_rows
 
 
 def compiled_before() -> bool:
-    """Whether an earlier run on this machine has left compiled loops behind."""
-    return any(Path(u_epoch.stats.cache_path).glob("kernels.u_epoch*.nbi"))
+    """Whether an earlier run on this machine has left compiled loops behind, or none are compiled at all."""
+    return numba.config.DISABLE_JIT or any(Path(u_epoch.stats.cache_path).glob("kernels.u_epoch*.nbi"))
 
 
 @numba.njit(cache=True, error_model="numpy", nogil=True)
@@ -69,6 +70,25 @@ def _fma(typing, a, b, c):
         return builder.fma(*arguments)
 
     return signature, generate
+
+
+def _fma_uncompiled(a, b, c):
+    """``_fma`` in fractions, which are rounded once."""
+    if not (math.isfinite(a) and math.isfinite(b)):
+        return np.float64(a) * b + c
+    if not math.isfinite(c):
+        return np.float64(c)  # however large the product is
+    exact = Fraction(a) * Fraction(b) + Fraction(c)
+    if not exact:
+        return np.float64(a) * b + c  # a zero of the right sign
+    try:
+        return np.float64(exact)
+    except OverflowError:
+        return np.float64(math.inf if exact > 0 else -math.inf)
+
+
+if numba.config.DISABLE_JIT:
+    _fma = _fma_uncompiled
 
 
 @numba.njit(cache=True, error_model="numpy", nogil=True)

@@ -21,7 +21,7 @@ from erl_torch.checks import InputError
 from erl_torch.experience.sampling import Sampler
 from erl_torch.experience.simulation import TUPLE_BYTES, ReplicaExperience, Simulation, fits, tuples_of
 from erl_torch.experience.transitions import Transitions
-from erl_torch.learners.learner import NonFiniteError
+from erl_torch.learners.learner import NonFiniteError, Streaming
 from erl_torch.learners.s1 import device as s1_torch
 from erl_torch.learners.s1 import kernels
 from erl_torch.learners.s1.algorithm import AlgorithmS1, S1State, S1Stream, gains, line_12, positive, reward_biases
@@ -77,6 +77,15 @@ class LanesState:
     psi_epochs: np.ndarray  # [R]
     psi_converged: np.ndarray  # [R] bool
     ended: Mapping[int, tuple[S1State, NonFiniteError]]  # replicas that left the finite numbers
+
+    @property
+    def work(self) -> int:
+        ended = [last.n_tuples for last, _ in self.ended.values()]
+        return self.n_tuples * (len(self.beta) - len(ended)) + sum(ended)
+
+    def milestone(self, learners: Sequence[Streaming[Any, Any]]) -> str:
+        alive = next((r for r in range(len(self.beta)) if r not in self.ended), None)
+        return "" if alive is None else learners[alive].milestone(self.replica(alive))
 
     @property
     def failures(self) -> Mapping[int, NonFiniteError]:
@@ -168,8 +177,11 @@ class Engine:
     @cached_property
     def learner(self) -> AlgorithmS1:
         """One of them, for what is common."""
-        learner: AlgorithmS1 = self.replicas.learners[0]
-        return learner
+        return self.learners[0]
+
+    @cached_property
+    def learners(self) -> tuple[AlgorithmS1, ...]:
+        return tuple(learner for learner in self.replicas.learners if isinstance(learner, AlgorithmS1))
 
     @cached_property
     def prior(self) -> np.ndarray:
@@ -177,7 +189,7 @@ class Engine:
 
     @cached_property
     def beta(self) -> np.ndarray:
-        return np.array([learner.beta for learner in self.replicas.learners])
+        return np.array([learner.beta for learner in self.learners])
 
     @cached_property
     def n_pairs(self) -> int:
@@ -185,7 +197,7 @@ class Engine:
 
     def init(self) -> LanesState:
         """The state of all replicas before any tuple."""
-        starts = [learner.init(self.n_states, self.n_actions) for learner in self.replicas.learners]
+        starts = [learner.init(self.n_states, self.n_actions) for learner in self.learners]
         n = len(starts)
         table = np.zeros((n, self.n_states, self.n_actions))
         return LanesState(
@@ -247,7 +259,7 @@ class Engine:
         mdp, n_tuples = simulation.mdp, simulation.n_tuples
         behaviour = self.prior if simulation.behaviour_policy is None else simulation.behaviour_policy
         keep = fits(simulation, len(self.replicas), TUPLE_BYTES)
-        lr_psi = np.array([learner.lr_psi for learner in self.replicas.learners])
+        lr_psi = np.array([learner.lr_psi for learner in self.learners])
         n, nnz = len(self.replicas), mdp.transition.nnz
         visits = np.zeros((n, self.n_pairs), np.int64)
         weight, scale = np.zeros((n, nnz)), np.ones((n, self.n_pairs))
@@ -290,7 +302,7 @@ class Engine:
 
     def _rho_max(self, largest: np.ndarray) -> np.ndarray:
         bounds = []
-        for learner, reward in zip(self.replicas.learners, largest, strict=True):
+        for learner, reward in zip(self.learners, largest, strict=True):
             try:
                 bounds.append(learner.largest_rho(float(reward)))
             except NonFiniteError:
@@ -298,7 +310,7 @@ class Engine:
         return np.array(bounds)
 
     def _recorded(self, pool: ThreadPoolExecutor) -> Lanes:
-        learners, shared = self.replicas.learners, isinstance(self.experience, Transitions)
+        learners, shared = self.learners, isinstance(self.experience, Transitions)
         n = len(learners)
 
         def prepared(r: int) -> S1Stream:
@@ -459,7 +471,7 @@ class Engine:
 
     def _failure(self, before: LanesState, r: int) -> NonFiniteError:
         """What replica ``r`` says of it when it runs alone: the same numbers, tuple by tuple."""
-        learner = self.replicas.learners[r]
+        learner = self.learners[r]
         try:
             stream = learner.prepare(tuples_of(self.experience, r, self.prior), self.n_states, self.n_actions)
             learner.step(before.replica(r), stream)
@@ -500,7 +512,7 @@ class Engine:
         z = state.u * state.psi_in_use[:, :, None]
         g, z = (x.reshape(len(self.replicas), self.n_pairs) for x in (g, z))
         q = 1 / state.rho
-        learners = self.replicas.learners
+        learners = self.learners
         rates = (
             np.array([learner.lr_u for learner in learners]),
             np.array([learner.rate_of_rho(self.n_states) for learner in learners]),

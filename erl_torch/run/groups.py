@@ -1,0 +1,211 @@
+"""Replicas in groups of the same settings, and the record of their figures."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from erl_torch import checks, pictures
+from erl_torch.checks import InputError
+from erl_torch.log.tensorboard import Board
+
+QUANTITIES = {
+    "theta": "theta, reward a step",
+    "rho": "rho",
+    "delta_max": "largest reward bias, reward",
+    "empirical_width": "bound on the loss in the empirical model, reward a step",
+    "reward_per_step": "reward a step",
+    "objective": "objective J, reward a step",
+    "return": "return of an episode, reward",
+}  # what is logged of replicas, as far as there is
+LOGGED = ("mean", "median", "q25", "q75", "min", "max")
+MOST_LOGGED = 24  # groups with curves of their own; all are in result.json and in the pictures
+
+
+@dataclass(frozen=True)
+class Group:
+    """Replicas with the same settings."""
+
+    settings: Mapping[str, float]  # those that vary
+    members: slice  # of all replicas
+    beta: float
+
+    @property
+    def name(self) -> str:
+        """As a part of tags: ``replicas``, or ``beta_2``."""
+        return "-".join(f"{key}_{value:g}" for key, value in self.settings.items()) or "replicas"
+
+    @property
+    def title(self) -> str:
+        return ", ".join(f"{key} {value:g}" for key, value in self.settings.items())
+
+
+def groups_of(vary: Mapping[str, Any], n_replicas: int, settings: Mapping[str, Any]) -> list[Group]:
+    """Every combination of the values that vary, in their order: ``n_replicas`` of each.
+
+    Args:
+        vary: a number, or a list of numbers, by the setting that takes them.
+        n_replicas: in each group.
+        settings: those of the learner, by name.
+
+    Raises:
+        InputError: a key that is no setting of the learner, or values that are not numbers.
+    """
+    names = [name for name in settings if name not in ("name", "class", "prior_policy")]
+    columns = {}
+    for key, values in vary.items():
+        column = values if isinstance(values, list) else [values]
+        if key not in names:
+            raise InputError(f"vary.{key}", values, f"left out: the settings of the learner are {', '.join(names)}")
+        if not column or not all(checks.is_number(value) for value in column):
+            raise InputError(f"vary.{key}", values, "a list of numbers")
+        if any(abs(value) > checks.LARGEST_INTEGER for value in column if isinstance(value, int)):
+            raise InputError(f"vary.{key}", values, "whole numbers below 2**63")
+        columns[key] = column
+    groups = []
+    for i, values in enumerate(itertools.product(*columns.values())):
+        varied = dict(zip(columns, values, strict=True))
+        members = slice(i * n_replicas, (i + 1) * n_replicas)
+        groups.append(Group(varied, members, float(varied.get("beta", settings["beta"]))))
+    return groups
+
+
+def statistics(values: np.ndarray) -> dict[str, float]:
+    """mean, quartiles and extremes of [n] finite values."""
+    low, middle, high = np.quantile(values, (0.25, 0.5, 0.75))
+    return {
+        "mean": float(values.mean()),
+        "q25": float(low),
+        "median": float(middle),
+        "q75": float(high),
+        "min": float(values.min()),
+        "max": float(values.max()),
+    }
+
+
+class Record:
+    """Figures of all replicas, record by record."""
+
+    def __init__(self, groups: Sequence[Group], optima: Sequence[Mapping[str, float]]) -> None:
+        self.groups, self.optima = groups, optima
+        self.prior: dict[str, float] = {}  # by tag
+        self.steps: dict[str, list[int]] = {}
+        self.rows: dict[str, list[np.ndarray]] = {}
+        self.alive: dict[str, list[np.ndarray]] = {}
+
+    def content(self) -> tuple[Any, ...]:
+        """What a checkpoint keeps."""
+        return self.prior, self.steps, *({k: np.stack(v) for k, v in x.items()} for x in (self.rows, self.alive))
+
+    def lengths(self) -> dict[str, int]:
+        """Records so far, by quantity."""
+        return {name: len(steps) for name, steps in self.steps.items()}
+
+    def cut(self, lengths: Mapping[str, int]) -> None:
+        """Back to what it was at ``lengths``."""
+        for of_names in (self.steps, self.rows, self.alive):
+            for name in list(of_names):
+                if name in lengths:
+                    del of_names[name][lengths[name] :]
+                else:
+                    del of_names[name]
+
+    def restore(self, content: tuple[Any, ...]) -> None:
+        """Go on from ``content``."""
+        self.prior, self.steps = content[:2]
+        self.rows, self.alive = ({name: list(column) for name, column in x.items()} for x in content[2:])
+
+    def add(self, step: int, measured: Mapping[str, np.ndarray], board: Board, alive: np.ndarray | None = None) -> None:
+        for name in QUANTITIES:
+            if name not in measured:
+                continue
+            values = np.asarray(measured[name], dtype=np.float64)
+            good = np.isfinite(values) if alive is None else alive & np.isfinite(values)
+            self.steps.setdefault(name, []).append(step)
+            self.rows.setdefault(name, []).append(values)
+            self.alive.setdefault(name, []).append(good)
+            for group, known in zip(self.groups[:MOST_LOGGED], self.optima, strict=False):
+                inside = values[group.members][good[group.members]]
+                if not inside.size:
+                    continue
+                found, tag = statistics(inside), f"{group.name}/{name}"
+                if step == 0:
+                    self.prior[tag] = found["mean"]
+                lines = {"prior": self.prior.get(tag), "optimal": known.get(name)}
+                board.scalars({f"{tag}_{key}": found[key] for key in LOGGED}, step)
+                board.scalars({f"{tag}_{key}": value for key, value in lines.items() if value is not None}, step)
+
+    def statistics(self, group: Group) -> dict[str, Any]:
+        """Of the last record: statistics by quantity, replicas that count."""
+        found: dict[str, Any] = {"replicas": 0}
+        for name, rows in self.rows.items():
+            inside = rows[-1][group.members][self.alive[name][-1][group.members]]
+            found[name] = statistics(inside) if inside.size else None
+            found["replicas"] = max(found["replicas"], int(inside.size))
+        return found
+
+    def curves(self) -> dict[str, list[pictures.BandLine]]:
+        """For ``pictures.bands``: quantity -> one line per group."""
+        shown: dict[str, list[pictures.BandLine]] = {}
+        for name in ("theta", "delta_max", "reward_per_step", "objective", "return"):
+            if name not in self.rows or (name == "return" and "reward_per_step" in self.rows):
+                continue
+            lines = []
+            for group, known in zip(self.groups[:MOST_LOGGED], self.optima, strict=False):
+                points = [
+                    (step, statistics(row[group.members][good[group.members]]))
+                    for step, row, good in zip(self.steps[name], self.rows[name], self.alive[name], strict=True)
+                    if good[group.members].any()
+                ]
+                steps, found = zip(*points, strict=True) if points else ((), ())
+                lines.append(pictures.BandLine(group.title, steps, found, [known.get(name)] * len(steps)))
+            shown[name] = lines
+        return shown
+
+    def line(self) -> str:
+        """The last record in a line, over all replicas of the first group."""
+        shown = []
+        for name in ("theta", "delta_max", "reward_per_step", "objective"):
+            found = self.statistics(self.groups[0]).get(name)
+            if found:
+                shown.append(f"{name} {found['mean']:.5g} [{found['q25']:.5g}, {found['q75']:.5g}]")
+        more = f"  (first of {len(self.groups)} groups)" if len(self.groups) > 1 else ""
+        return "  ".join(shown) + more
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """``record/NAME`` [n, R] with ``record_step/NAME`` [n]."""
+        found = {f"record/{name}": np.stack(rows) for name, rows in self.rows.items()}
+        return found | {f"record_step/{name}": np.array(steps) for name, steps in self.steps.items()}
+
+    def final(self) -> dict[str, float]:
+        """Means over the replicas of the group with the best objective, by tag."""
+        rows = [self.statistics(group) for group in self.groups]
+        judged = [g for g, row in enumerate(rows) if row.get("objective")]
+        if not judged:
+            return {}
+        best = max(judged, key=lambda g: rows[g]["objective"]["mean"])
+        names = ("theta", "objective", "reward_per_step", "return")
+        final = {name: rows[best][name]["mean"] for name in names if rows[best].get(name)}
+        if "objective" in self.optima[best]:
+            final["gap"] = self.optima[best]["objective"] - final["objective"]
+        return {f"Final/{name}": value for name, value in final.items()}
+
+    def sweep(self) -> tuple[str, dict[str, list[pictures.BandLine]]]:
+        """The first setting that varies, and quantity -> one line per combination of the others."""
+        key = next(iter(self.groups[0].settings))
+        panels: dict[str, list[pictures.BandLine]] = {}
+        for name in ("theta", "objective", "delta_max"):
+            points: dict[str, list[tuple[float, dict[str, float], float | None]]] = {}
+            pairs = zip(self.groups, self.optima, strict=True)
+            for group, optimum in sorted(pairs, key=lambda pair: pair[0].settings[key]):
+                row = self.statistics(group).get(name)
+                if row is not None:
+                    others = ", ".join(f"{k} {v:g}" for k, v in group.settings.items() if k != key)
+                    points.setdefault(others, []).append((group.settings[key], row, optimum.get(name)))
+            if points:
+                panels[name] = [pictures.BandLine(others, *zip(*row, strict=True)) for others, row in points.items()]
+        return key, panels

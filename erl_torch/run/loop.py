@@ -1,0 +1,237 @@
+"""The run loop: a learner learns, a recorder writes, checkpoints are offered, until the learner is finished.
+
+One loop for a single learner, for replicas and for exact solvers. What differs between them is their recorder's:
+``erl_torch.run.single``, ``erl_torch.run.replicas``.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Generic, Protocol, TypeVar
+
+from tqdm import tqdm
+
+from erl_torch.checks import InputError
+from erl_torch.files import write_json
+from erl_torch.learners.learner import Learner, NonFiniteError, State, columns
+from erl_torch.log.tensorboard import Board, Boards
+from erl_torch.problem import Problem
+from erl_torch.run.checkpoint import Checkpoints, Content, Ended, rows_of
+
+SafePoint = Callable[[], None]
+Row = Mapping[str, Any]  # of the history: ``metrics()`` of a state
+S = TypeVar("S", bound=State)
+E = TypeVar("E")
+A = TypeVar("A")
+
+
+@dataclass
+class Outcome(Generic[S]):
+    """What a run has come to."""
+
+    state: S
+    history: list[Row] = field(default_factory=list)
+    seconds: float = 0.0  # of learning
+    stopped: BaseException | None = None  # what ended it before the learner was finished
+
+
+class Recorder(Protocol[S, A]):
+    """What a run makes of the states of its learner: figures of their policies, records on the board, files.
+
+    A run calls ``begin`` or ``restore``, ``open``, ``record`` after epochs, ``finish``, ``save``, ``result``.
+    """
+
+    def begin(self) -> None:
+        """Measure the prior policy; not called where a checkpoint is restored."""
+
+    @property
+    def boards(self) -> Boards:
+        """Charts of tab Custom Scalars."""
+
+    def open(self, board: Board, goes_on: bool) -> None:
+        """The record of the prior policy at step 0, unless the run ``goes_on`` from a checkpoint."""
+
+    def record(self, state: S, row: Row, milestone: str, board: Board) -> None:
+        """Measure the policy of ``state`` and write; ``row`` is its ``metrics()``."""
+
+    def line(self) -> str:
+        """The last record, in a line that is said at milestones."""
+
+    def content(self) -> Content:
+        """All that a checkpoint keeps, by names of its own."""
+
+    def restore(self, content: Content) -> None:
+        """Go on from ``content``."""
+
+    def mark(self) -> Content:
+        """Where ``back`` leads: light, for it is taken after every epoch."""
+
+    def back(self, mark: Content) -> None:
+        """To the figures as they were at ``mark``."""
+
+    def finish(self, outcome: Outcome[S], solution: A, board: Board) -> A:
+        """The records of the end, and the solution with what is known of it."""
+
+    def save(self, solution: A, directory: Path) -> None:
+        """Write ``solution`` to the run directory."""
+
+    def result(self, outcome: Outcome[S], solution: A) -> dict[str, Any]:
+        """What ``result.json`` holds, but for the seconds and notes of the run."""
+
+    def summary(self, result: Mapping[str, Any], directory: Path) -> str:
+        """The text at the end."""
+
+    def failed(self, solution: A) -> NonFiniteError | None:
+        """What is to be raised of a run that went to its end, for learners that left the finite numbers."""
+
+
+@dataclass(frozen=True, eq=False)
+class Run(Generic[S, E, A]):
+    """Everything that a run is made of.
+
+    Args:
+        learner, problem: who learns, and what.
+        experience: what from; None of a learner that solves the model.
+        digest: a checksum of the experience, which a checkpoint must share; None where its settings tell all.
+        recorder: what is made of the states.
+        saved: checkpoints, of the run directory.
+        hyperparameters: by name, for tab HParams.
+        configuration: the settings as text, for tab Text.
+        every: epochs between records; milestones are always recorded.
+        talks: progress bar, milestones and summary are shown.
+        safe_point: called after every epoch; may raise SystemExit or KeyboardInterrupt.
+        began: ``time.perf_counter()`` when the run began.
+    """
+
+    learner: Learner[S, E, A]
+    problem: Problem
+    experience: E | None
+    digest: object
+    recorder: Recorder[S, A]
+    saved: Checkpoints
+    hyperparameters: Mapping[str, int | float | str]
+    configuration: str
+    every: int
+    talks: bool
+    safe_point: SafePoint
+    began: float
+
+    def perform(self, notes: list[str]) -> dict[str, Any]:
+        """Go through the run, or what is left of it; returns what ``result.json`` holds.
+
+        Whatever ends it, what was learnt until then is written, and the error goes on to the caller.
+        """
+        saved, recorder, learner = self.saved, self.recorder, self.learner
+        outcome = Outcome(learner.start(self.problem))
+        checkpoint, began = saved.start(learner.states), self.began
+        if checkpoint:
+            if checkpoint["digest"] != self.digest:
+                raise InputError("experience", "another stream", "the one that the run in its directory began with")
+            outcome = Outcome(checkpoint["state"], [*rows_of(checkpoint["history"])], checkpoint["learning"])
+            recorder.restore(checkpoint)
+            began -= checkpoint["seconds"]
+        else:
+            recorder.begin()
+        solution: A | None = None
+        ended = Ended(lambda: solution is not None)
+        mark = checkpoint["events"] if checkpoint else None
+        board = Board(saved.directory, self.hyperparameters, recorder.boards, mark)
+        with ended, saved.refusing(lambda: bool(outcome.history)), board:
+            if not checkpoint:
+                board.texts(self.configuration)
+            recorder.open(board, checkpoint is not None)
+            self._learn(outcome, checkpoint is not None, board, ended, began)
+            solution = learner.solution(outcome.state, outcome.history, outcome.stopped)
+            solution = recorder.finish(outcome, solution, board)
+            if isinstance(outcome.stopped, NonFiniteError) or recorder.failed(solution) is not None:
+                board.failed()
+        assert solution is not None
+        outcome.stopped = outcome.stopped or ended.error
+        recorder.save(solution, saved.directory)
+        result = recorder.result(outcome, solution)
+        result["seconds"] = round(time.perf_counter() - began, 3)
+        result["notes"] = notes
+        write_json(saved.directory / "result.json", result)
+        if self.talks:
+            print(recorder.summary(result, saved.directory))
+        if outcome.stopped is not None:
+            raise outcome.stopped
+        saved.clear()
+        if (failure := recorder.failed(solution)) is not None:
+            raise failure
+        return result
+
+    def _learn(self, outcome: Outcome[S], goes_on: bool, board: Board, ended: Ended, began: float) -> None:
+        """The loop. What ends it goes into ``outcome``; with nothing learnt, it is raised."""
+        learner, recorder = self.learner, self.recorder
+
+        def reached() -> Content:
+            """What an epoch leaves when all is done that belongs to it: an error may come in the midst of that."""
+            own = {"state": outcome.state, "n": len(outcome.history), "learning": outcome.seconds}
+            return own | {"events": board.mark(), "recorder": recorder.mark()}
+
+        def content() -> Content:
+            return recorder.content() | {
+                "state": outcome.state,
+                "history": columns(outcome.history),
+                "events": board.flush(),
+                "learning": outcome.seconds,
+                "seconds": time.perf_counter() - began,
+                "digest": self.digest,
+            }
+
+        last = reached()
+        try:
+            with self._bar() as bar:
+                bar.update(learner.work(outcome.state))
+                states = learner.run(self.problem, self.experience, outcome.state if goes_on else None)
+                for state in _timed(states, outcome):
+                    row = state.metrics()
+                    outcome.state = state
+                    outcome.history.append(row)
+                    milestone = learner.milestone(state)
+                    if milestone or len(outcome.history) % self.every == 0:
+                        recorder.record(state, row, milestone, board)
+                    bar.set_postfix_str(learner.progress(state), refresh=False)
+                    bar.update(learner.work(state) - bar.n)
+                    if milestone and self.talks:
+                        tqdm.write(f"{milestone}: {recorder.line()}", file=sys.stderr)
+                    last = reached()
+                    if not learner.needs_model:
+                        self.saved.offer(learner.position(state), content)
+                    self.safe_point()
+        except (Exception, KeyboardInterrupt, SystemExit) as error:
+            outcome.stopped, outcome.state = error, last["state"]
+            del outcome.history[last["n"] :]
+            recorder.back(last["recorder"])
+            nothing_learnt = not outcome.history
+            if nothing_learnt and not isinstance(error, (NonFiniteError, KeyboardInterrupt, SystemExit)):
+                raise
+            if not (learner.needs_model or nothing_learnt or isinstance(error, NonFiniteError)):
+                at = {"events": last["events"], "learning": last["learning"]}
+                ended.keep(self.saved, learner.position(outcome.state), lambda: content() | at)
+
+    def _bar(self) -> tqdm:
+        total = self.learner.total(self.experience)
+        return tqdm(
+            total=total, desc="learning", unit=f" {self.learner.unit}", unit_scale=True,
+            disable=None if self.talks else True,
+            bar_format="{l_bar}{bar:20}| {elapsed}<{remaining}, {rate_fmt}{postfix}" if total else None,
+        )  # fmt: skip
+
+
+def _timed(states: Iterator[S], outcome: Outcome[S]) -> Iterator[S]:
+    """``states``; the seconds spent in them, apart from what their caller does in between, go to ``outcome``."""
+    while True:
+        tick = time.perf_counter()
+        try:
+            state = next(states)
+        except StopIteration:
+            return
+        finally:
+            outcome.seconds += time.perf_counter() - tick
+        yield state

@@ -1,0 +1,426 @@
+"""The recorder of a run of replicas: statistics per group of the same settings, bands, ``replicas.npz``."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from erl_torch import pictures
+from erl_torch.empirical import reservations
+from erl_torch.empirical.reservations import Counted, Reservation
+from erl_torch.empirical.uncertainty import Estimate
+from erl_torch.evaluation import Judge, evaluate
+from erl_torch.experience.collect import COLUMN_BYTES
+from erl_torch.experience.simulation import KEEP_BYTES, ReplicaExperience, Simulation
+from erl_torch.experience.transitions import Transitions
+from erl_torch.files import write_png
+from erl_torch.learners.learner import NonFiniteError, Streaming
+from erl_torch.learners.replicas import Replicas, ReplicaSolution, ReplicaState
+from erl_torch.log.tensorboard import Board, Boards, replica_layout
+from erl_torch.mdp.tabular import TabularMDP, check_policy
+from erl_torch.notes import note
+from erl_torch.problem import Problem
+from erl_torch.rng import streams
+from erl_torch.run.checkpoint import Content
+from erl_torch.run.groups import MOST_LOGGED, QUANTITIES, Group, Record, statistics
+from erl_torch.run.judge import SMALL, EvaluationSettings, episode_model, judging_model, of_data
+from erl_torch.run.loop import Outcome, Row, SafePoint
+from erl_torch.run.report import Title, ended_as, last_rows, plural, versions
+from erl_torch.solution import Status
+from erl_torch.solvers import solve_soft_bellman
+
+FEW = 24  # replicas whose simulated streams are sampled once more, to hold theta against what they say
+
+
+@dataclass(eq=False)
+class ReplicaRecorder:
+    """``erl_torch.run.loop.Recorder`` of replicas.
+
+    Args:
+        replicas, problem, experience: as of the run.
+        groups: of the same settings, in the order of the replicas.
+        seeds: one per replica.
+        vary: the values of the settings that vary, by name.
+        settings: what is measured.
+        title: names, for result, pictures and summary.
+        safe_point: called between streams that are read; may raise.
+    """
+
+    replicas: Replicas
+    problem: Problem
+    experience: ReplicaExperience
+    groups: Sequence[Group]
+    seeds: Sequence[int]
+    vary: Mapping[str, Any]
+    settings: EvaluationSettings
+    title: Title
+    safe_point: SafePoint
+
+    def __post_init__(self) -> None:
+        learners = self.replicas.learners
+        betas = [learner.beta for learner in learners]
+        self.judges = Judges(self.problem, self.settings, betas, self.seeds, self.replicas.workers)
+        texts, self.data = reservations_of(
+            self.experience, learners, self.problem.prior, self.judges.model, self.settings.certify, self.safe_point
+        )
+        for text in texts:
+            note(text)
+        by_beta = {beta: self._optimum(beta) for beta in {group.beta for group in self.groups}}
+        self.optima = [by_beta[group.beta] for group in self.groups]
+        self.recorded = Record(self.groups, self.optima)
+        self.first: dict[str, np.ndarray] = {}
+
+    def _optimum(self, beta: float) -> dict[str, float]:
+        """Figures of the optimum of a small known model, by quantity; none where there is none."""
+        model = self.judges.model
+        if model is None or not self.settings.certify or model.n_states > SMALL:
+            return {}
+        optimum = solve_soft_bellman(model, beta, self.problem.prior)
+        if optimum.status is not Status.CONVERGED or optimum.theta is None:
+            return {}
+        figures = {"theta": optimum.theta, "delta_max": optimum.reward_bias_max, "objective": -optimum.theta}
+        return figures | self.judges.rewards(optimum.policy.numpy())
+
+    @property
+    def n_experience(self) -> int:
+        """Tuples of the longest stream."""
+        if isinstance(self.experience, Simulation):
+            return self.experience.n_tuples
+        return len(self.experience) if isinstance(self.experience, Transitions) else max(map(len, self.experience))
+
+    # -- records --------------------------------------------------------------------------------------
+
+    def begin(self) -> None:
+        self.first = self.judges(np.repeat(self.problem.prior[None], len(self.replicas), axis=0), True)
+
+    @property
+    def boards(self) -> Boards:
+        metrics = self.replicas.learners[0].start(self.problem).metrics()
+        optima = dict(zip((group.name for group in self.groups[:MOST_LOGGED]), self.optima, strict=False))
+        return replica_layout(optima, [*metrics, *self.first])
+
+    def open(self, board: Board, goes_on: bool) -> None:
+        if not goes_on:
+            self.recorded.add(0, self.first, board)
+
+    def record(self, state: ReplicaState, row: Row, milestone: str, board: Board) -> None:
+        measured = {**row, **self.judges(state.policy.numpy(), bool(milestone))}
+        alive = np.array([r not in state.failures for r in range(len(self.replicas))])
+        self.recorded.add(state.n_tuples, measured, board, alive)
+
+    def line(self) -> str:
+        return self.recorded.line()
+
+    # -- checkpoints ----------------------------------------------------------------------------------
+
+    def content(self) -> Content:
+        return {"record": self.recorded.content(), "evaluation": self.judges.generators()}
+
+    def restore(self, content: Content) -> None:
+        self.recorded.restore(content["record"])
+        self.judges.restore(content["evaluation"])
+
+    def mark(self) -> Content:
+        return {"lengths": self.recorded.lengths(), "evaluation": self.judges.generators()}
+
+    def back(self, mark: Content) -> None:
+        self.recorded.cut(mark["lengths"])
+        self.judges.restore(mark["evaluation"])
+
+    # -- the end --------------------------------------------------------------------------------------
+
+    def finish(self, outcome: Outcome[ReplicaState], solution: ReplicaSolution, board: Board) -> ReplicaSolution:
+        step = outcome.state.n_tuples
+        per_setting = " of each setting" if len(self.groups) > 1 else ""
+        title = f"{self.title.env}, {self.title.learner}: {plural(self._n_each, 'replica')}{per_setting}"
+        drawn = [("bands", self.recorded.curves(), "tuples streamed, each replica", title)]
+        if self.vary:
+            key, panels = self.recorded.sweep()
+            drawn.append(("sweep", panels, key, f"{title}, at the end"))
+        for name, panels, x_label, heading in drawn:
+            markers = name == "sweep"
+            whole = pictures.bands({QUANTITIES[k]: v for k, v in panels.items()}, x_label, heading, markers)
+            write_png(board.directory / f"{name}.png", whole)
+            for k, lines in panels.items():  # on TensorBoard's small cards one panel can be read
+                card = pictures.bands({QUANTITIES[k]: lines}, x_label, heading, markers, card=True)
+                board.picture(f"{name}/{k}", card, step)
+        rate = outcome.state.work / max(outcome.seconds, 1e-9)
+        board.scalars({"time/tuples_per_second": rate}, step)
+        board.scalars(self.recorded.final(), step)
+        for text in reservations.of_replicas(self._outcomes(solution)):
+            note(text)
+        return solution
+
+    @property
+    def _n_each(self) -> int:
+        """Replicas of each group."""
+        return len(self.replicas) // len(self.groups)
+
+    def _outcomes(self, solution: ReplicaSolution) -> list[list[Reservation]]:
+        """How each replica ended, and what its theta shows."""
+        exact = self.judges.model is not None
+        rows = self.recorded.rows["objective"] if exact else [np.full(len(solution), np.nan)]
+        return [
+            reservations.of_outcome(one.status, one.message, float(learnt), float(prior))
+            + reservations.of_theta(one.theta, *against)
+            for one, learnt, prior, against in zip(solution.solutions, rows[-1], rows[0], self.data, strict=True)
+        ]
+
+    def save(self, solution: ReplicaSolution, directory: Path) -> None:
+        varied = {f"vary/{key}": np.empty(len(self.replicas)) for key in self.groups[0].settings}
+        for group in self.groups:
+            for key, value in group.settings.items():
+                varied[f"vary/{key}"][group.members] = value
+        more = self.recorded.arrays() | {"seed": np.array(self.seeds)} | varied
+        solution.save(directory / "replicas.npz", more)
+
+    def failed(self, solution: ReplicaSolution) -> NonFiniteError | None:
+        """The first failure, with how many there are."""
+        if not solution.failures:
+            return None
+        r, error = min(solution.failures.items())
+        n_failed, n = len(solution.failures), len(self.replicas)
+        others = f" ({n_failed} of {n} replicas ended so)" if n_failed > 1 else ""
+        beta = self.replicas.learners[r].beta
+        return NonFiniteError(error.step, f"replica {r} (seed {self.seeds[r]}, beta {beta:g}): {error.cause}{others}")
+
+    def result(self, outcome: Outcome[ReplicaState], solution: ReplicaSolution) -> dict[str, Any]:
+        stopped = outcome.stopped
+        rows = [self.recorded.statistics(group) for group in self.groups]
+        objectives = [row["objective"]["mean"] for row in rows if row.get("objective")]
+        return {
+            "env": self.title.env,
+            "learner": self.title.learner,
+            "seed": self.title.seed,
+            "n_replicas": self._n_each,
+            "vary": dict(self.vary),
+            "status": Status.STOPPED.name.lower() if stopped else _status(solution),
+            "message": f"{type(stopped).__name__}: {stopped}" if isinstance(stopped, Exception) else "",
+            "failures": {str(r): str(error) for r, error in solution.failures.items()},
+            "objective": max(objectives, default=None),  # of the best group
+            "groups": [
+                {"settings": dict(group.settings), "beta": group.beta, "exact": optimum, **row}
+                for group, optimum, row in zip(self.groups, self.optima, rows, strict=True)
+            ],
+            "data_half_widths": self._half_widths(solution),
+            "n_experience": self.n_experience,
+            "n_tuples": outcome.state.work,
+            "seconds_learning": round(outcome.seconds, 3),
+            "versions": versions(),
+        }
+
+    def _half_widths(self, solution: ReplicaSolution) -> dict[str, float] | None:
+        """Statistics of how far each theta is from what its own stream says; None where no stream has an interval."""
+        away = [
+            reservations.half_widths(one.theta, data.estimate)
+            for one, data in zip(solution.solutions, self.data, strict=True)
+        ]
+        finite = np.array([x for x in away if np.isfinite(x)])
+        return statistics(finite) | {"replicas": len(finite)} if finite.size else None
+
+    def summary(self, result: Mapping[str, Any], directory: Path) -> str:
+        name = f"{self.title.env}, {self.title.learner}"
+        last_seed = self.title.seed + self._n_each - 1
+        seeds = f"seed {self.title.seed}" if self._n_each == 1 else f"seeds {self.title.seed} to {last_seed}"
+        table = _one_group if len(self.groups) == 1 else _many_groups
+        lines = ["", *table(name, seeds, self.groups, result)]
+        if (away := result["data_half_widths"]) is not None:
+            lines.append(
+                f"{'the data say':18}theta is off by {away['median']:.3g} half widths of the 95% interval of its own "
+                f"stream (median; at most {away['max']:.3g}; {away['replicas']} of {len(self.replicas)} streams have "
+                "one)"
+            )
+        rate = result["n_tuples"] / max(result["seconds_learning"], 1e-3) / 1e6
+        lines.append(f"{'tuples streamed':18}{result['n_tuples']:,} ({rate:.3g} M/s)")
+        return "\n".join([*lines, *last_rows(result, directory)])
+
+
+def _status(solution: ReplicaSolution) -> str:
+    """The one that asks for most: what ended badly comes first."""
+    statuses = {one.status for one in solution.solutions}
+    for status in (Status.NON_FINITE, Status.STOPPED, Status.PSI_LIMIT, Status.STEP_LIMIT):
+        if status in statuses:
+            return status.name.lower()
+    return sorted(status.name for status in statuses)[0].lower()
+
+
+# -- what policies and streams are held against ------------------------------------------------------
+
+
+class Judges:
+    """Figures of the policies of all replicas: exact ones of the model, and episodes played at milestones."""
+
+    def __init__(
+        self,
+        problem: Problem,
+        settings: EvaluationSettings,
+        betas: Sequence[float],
+        seeds: Sequence[int],
+        threads: int,
+    ) -> None:
+        self.problem, self.betas, self.n_episodes, self.threads = problem, betas, settings.n_episodes, threads
+        self.rngs = [streams(seed).evaluation for seed in seeds]
+        self.model = judging_model(problem, settings)
+        self.episode = None if self.model is None else episode_model(problem)
+
+    def generators(self) -> list[Any]:
+        """States of the generators that play episodes."""
+        return [rng.bit_generator.state for rng in self.rngs]
+
+    def restore(self, states: list[Any]) -> None:
+        """Set the generators to ``states``."""
+        for rng, state in zip(self.rngs, states, strict=True):
+            rng.bit_generator.state = state
+
+    @functools.cached_property
+    def of_model(self) -> Judge:
+        """Of the model that there is."""
+        assert self.model is not None
+        return Judge(self.model, self.problem.prior, self.problem.horizon)
+
+    @functools.cached_property
+    def of_episode(self) -> Judge:
+        """Of the episodes' model that there is."""
+        assert self.episode is not None
+        return (
+            self.of_model
+            if self.episode is self.model
+            else Judge(self.episode, self.problem.prior, self.problem.horizon)
+        )
+
+    def rewards(self, policy: np.ndarray) -> dict[str, float]:
+        """Reward per step of a policy [S, A], and return of an episode where its model is known."""
+        figures = {"reward_per_step": self.of_model.reward_per_step(policy)}
+        if self.episode is not None:
+            figures["return"] = self.problem.horizon * self.of_episode.reward_per_step(policy)
+        return figures
+
+    def __call__(self, policies: np.ndarray, milestone: bool) -> dict[str, np.ndarray]:
+        """Figures of policies [R, S, A], [R] each."""
+        figures: dict[str, np.ndarray] = {}
+
+        def each(figure: Callable[[int], float]) -> np.ndarray:
+            with ThreadPoolExecutor(self.threads) as pool:
+                return np.array(list(pool.map(figure, range(len(policies)))))
+
+        if self.model is not None:
+            figures["reward_per_step"] = each(lambda r: self.of_model.reward_per_step(policies[r]))
+            figures["objective"] = each(lambda r: self.of_model.objective(policies[r], self.betas[r]))
+        if self.episode is not None:
+            if self.episode is self.model:
+                figures["return"] = self.problem.horizon * figures["reward_per_step"]
+            else:
+                figures["return"] = self.problem.horizon * each(lambda r: self.of_episode.reward_per_step(policies[r]))
+        elif milestone:
+            played = [
+                evaluate(self.problem.env, policy, beta, rng, self.n_episodes, self.problem.horizon, self.problem.prior)
+                for policy, beta, rng in zip(policies, self.betas, self.rngs, strict=True)
+            ]
+            figures["return"] = np.array([one.mean_return for one in played])
+            if self.model is None:
+                figures["reward_per_step"] = np.array([one.reward_per_step for one in played])
+                figures["objective"] = np.array([one.objective for one in played])
+        return figures
+
+
+class Data(NamedTuple):
+    """What theta is held against once it is learnt."""
+
+    rewards: tuple[float, float]  # (low, high)
+    estimate: Estimate | None
+
+
+def reservations_of(
+    experience: ReplicaExperience,
+    learners: Sequence[Streaming[Any, Any]],
+    prior: np.ndarray,
+    model: TabularMDP | None,
+    certify: bool,
+    safe_point: SafePoint,
+) -> tuple[list[str], list[Data]]:
+    """(notes on what streams do not allow the learners, what theta is to be held against); each stream is read once.
+    Theta is not held against the model's."""
+    shape = prior.shape
+
+    def data_of(here: Counted, learner: Streaming[Any, Any]) -> Data:
+        return Data(here.tally.reward_range, of_data(here.model, learner.beta, prior) if certify else None)
+
+    if isinstance(experience, Simulation):  # of the model itself: it is not held against the model
+        behaviour = experience.behaviour_policy
+        rewards = float(experience.mdp.reward.min()), float(experience.mdp.reward.max())
+        own = reservations.of_rewards(*rewards)
+        if learners[0].drawn_from_prior == "a" and behaviour is not None:
+            table = check_policy("experience.behaviour_policy", behaviour, prior.shape[0], prior.shape[1])
+            draws = np.rint(experience.n_tuples * table / len(table))  # as if it were in all states alike
+            own += reservations.of_actions(draws, prior, "a")
+        held = [Data(rewards, None)] * len(learners)
+        few = len(learners) <= FEW and experience.n_tuples * COLUMN_BYTES <= KEEP_BYTES
+        if certify and few and experience.mdp.n_states <= SMALL:
+            same: dict[int, list[int]] = {}
+            for r, seed in enumerate(experience.seeds):
+                same.setdefault(int(seed), []).append(r)
+            for members in same.values():
+                safe_point()
+                here = reservations.count(experience.stream(members[0], prior), shape[0], shape[1], False)
+                for r in members:
+                    held[r] = data_of(here, learners[r])
+        return reservations.of_replicas([own] * len(learners)), held
+    next_actions = any(learner.drawn_from_prior == "a_next" for learner in learners)
+    streams_of = [experience] * len(learners) if isinstance(experience, Transitions) else experience
+    counted: dict[int, Counted] = {}
+    found: list[list[Reservation]] = []
+    held = []
+    for learner, data in zip(learners, streams_of, strict=True):
+        if id(data) not in counted:
+            counted[id(data)] = reservations.count(data, shape[0], shape[1], next_actions)
+        here = counted[id(data)]
+        against = (
+            [] if model is None else reservations.of_model(here, model) + reservations.of_states(here.tally, model)
+        )
+        found.append(reservations.of_stream(here, learner, prior) + against)
+        held.append(data_of(here, learner))
+    return reservations.of_replicas(found), held
+
+
+# -- tables of the summary ----------------------------------------------------------------------------
+
+
+def _one_group(first: str, seeds: str, groups: Sequence[Group], result: Mapping[str, Any]) -> Iterator[str]:
+    (group,) = result["groups"]
+    yield f"{first}, beta {group['beta']:g}, {plural(result['n_replicas'], 'replica')} ({seeds}): {ended_as(result)}"
+    yield f"{'':18}{'mean':>12}{'quartiles':>26}{'extremes':>26}{'exact':>12}"
+    for name in QUANTITIES:
+        found = group.get(name)
+        if found:
+            quartiles = f"{found['q25']:.5g} to {found['q75']:.5g}"
+            extremes = f"{found['min']:.5g} to {found['max']:.5g}"
+            known = f"{group['exact'][name]:12.6g}" if name in group["exact"] else ""
+            yield f"{name.replace('_', ' '):18}{found['mean']:12.6g}{quartiles:>26}{extremes:>26}{known}"
+
+
+def _many_groups(first: str, seeds: str, groups: Sequence[Group], result: Mapping[str, Any]) -> Iterator[str]:
+    yield f"{first}, {len(groups)} settings, {seeds} each: {ended_as(result)}"
+    width = max(len(group.title) for group in groups) + 2
+    yield f"{'':{width}}{'theta':>11}{'quartiles':>24}{'exact':>11}{'objective':>12}{'at most':>11}"
+    shown = result["groups"] if len(groups) <= 40 else [*result["groups"][:20], None, *result["groups"][-19:]]
+    for found in shown:
+        if found is None:
+            yield "..."
+            continue
+        theta, objective, best = found.get("theta"), found.get("objective"), found["exact"]
+        title = ", ".join(f"{key} {value:g}" for key, value in found["settings"].items())
+        cells = [
+            f"{theta['mean']:.6g}" if theta else "-",
+            f"{theta['q25']:.5g} to {theta['q75']:.5g}" if theta else "-",
+            f"{best['theta']:.6g}" if best else "-",
+            f"{objective['mean']:.6g}" if objective else "-",
+            f"{best['objective']:.6g}" if best else "-",
+        ]
+        widths = (11, 24, 11, 12, 11)
+        yield f"{title:{width}}" + "".join(f"{cell:>{w}}" for cell, w in zip(cells, widths, strict=True))

@@ -1,0 +1,310 @@
+"""The recorder of a run of one learner: exact figures or played episodes, pictures, certificate, ``solution.npz``."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from erl_torch import checks
+from erl_torch.checks import InputError
+from erl_torch.empirical import reservations
+from erl_torch.empirical.reservations import Reservation
+from erl_torch.empirical.uncertainty import Estimate
+from erl_torch.envs import grid_pictures
+from erl_torch.evaluation import Evaluation, evaluate
+from erl_torch.experience.experience import Experience
+from erl_torch.learners.learner import NonFiniteError, TabularLearner, TabularState
+from erl_torch.log.tensorboard import Board, Boards, layout
+from erl_torch.notes import note
+from erl_torch.problem import Policy, Problem
+from erl_torch.run.checkpoint import Content
+from erl_torch.run.judge import EvaluationSettings, judging_model, of_data
+from erl_torch.run.loop import Outcome, Row
+from erl_torch.run.report import (
+    Title,
+    data_tags,
+    evaluation_tags,
+    headline,
+    last_rows,
+    mean_return,
+    optimal_tags,
+    versions,
+)
+from erl_torch.solution import Solution, proven
+from erl_torch.solvers import certify, solve_soft_bellman
+
+
+@dataclass(eq=False)
+class SingleRecorder:
+    """``erl_torch.run.loop.Recorder`` of one learner.
+
+    Args:
+        learner, problem, experience: as of the run.
+        settings: what is measured.
+        rng: draws the episodes that are played.
+        title: names, for result and summary.
+        n_skipped: bad tuples that were left out of the experience.
+    """
+
+    learner: TabularLearner[Any]
+    problem: Problem
+    experience: Experience | None
+    settings: EvaluationSettings
+    rng: np.random.Generator
+    title: Title
+    n_skipped: int = 0
+
+    def __post_init__(self) -> None:
+        self.model = judging_model(self.problem, self.settings)
+        self.start: TabularState = self.learner.start(self.problem)
+        self.optimum = self._optimum() if self.settings.certify else None
+        self.estimate = self._estimate() if self.settings.certify else None
+        for _, text in self._reservations():
+            note(text)
+        self.first: Evaluation
+        self.last: Evaluation
+
+    # -- what it is held against ----------------------------------------------------------------------
+
+    def _optimum(self) -> Solution | None:
+        """The exact answer to the model; None where there is no model, or the run itself finds it."""
+        if self.model is None or self.learner.needs_model:
+            return None
+        try:
+            return solve_soft_bellman(self.model, self.learner.beta, self.problem.prior)
+        except (MemoryError, RuntimeError) as error:  # what factorisations need shows as they go
+            if not checks.out_of_memory(error):
+                raise
+            allowed = f"false: the exact solution of this model needs more memory than there is ({error})"
+            raise InputError("evaluation.certify", "true", allowed) from error
+
+    def _estimate(self) -> Estimate | None:
+        """theta* with its error, as the counts of the stream alone have it; None where there is no stream."""
+        if self.counts is None:
+            return None
+        return of_data(self.counts.model, self.learner.beta, self.problem.prior)
+
+    @functools.cached_property
+    def counts(self) -> reservations.Counted | None:
+        """The stream as counts."""
+        if self.experience is None:
+            return None
+        next_actions = self.learner.drawn_from_prior == "a_next"
+        return reservations.count(self.experience, self.problem.n_states, self.problem.n_actions, next_actions)
+
+    def _reservations(self) -> list[Reservation]:
+        """What the stream does not allow the learner, and where it contradicts the model."""
+        if self.counts is None:
+            return []
+        noted = reservations.of_stream(self.counts, self.learner, self.problem.prior)
+        if self.model is not None:
+            bounds = None if self.optimum is None else self.optimum.theta_bounds
+            noted += reservations.of_model(self.counts, self.model, self.estimate, bounds)
+            noted += reservations.of_states(self.counts.tally, self.model)
+        return noted
+
+    def _measure(self, policy: Policy) -> Evaluation:
+        p, e, exact = self.problem, self.settings, None
+        if p.episode is not None:
+            exact = functools.partial(mean_return, p.episode, p.horizon)
+        return evaluate(p.env, policy, self.learner.beta, self.rng, e.n_episodes, p.horizon, p.prior, self.model, exact)
+
+    # -- records --------------------------------------------------------------------------------------
+
+    def begin(self) -> None:
+        self.first = self.last = self._measure(self.start.policy)
+
+    @functools.cached_property
+    def _constant(self) -> dict[str, float]:
+        """Tags of what does not change."""
+        return evaluation_tags(self.first, "prior") | self._optimal(self.optimum) | data_tags(self.estimate)
+
+    def _optimal(self, solution: Solution | None) -> dict[str, float]:
+        return optimal_tags(solution, self.model, self.problem)
+
+    @property
+    def boards(self) -> Boards:
+        return layout([*self._names(self.start), *evaluation_tags(self.first)], self._constant)
+
+    def open(self, board: Board, goes_on: bool) -> None:
+        board.lines(self._constant)
+        if not goes_on:
+            board.record(self._tags(self.start, 0, self.start.metrics()), 0)
+            self._draw(self.start, 0, "prior policy", board)
+
+    def record(self, state: TabularState, row: Row, milestone: str, board: Board) -> None:
+        self.last = self._measure(state.policy)
+        position = self.learner.position(state)
+        board.record(self._tags(state, position, row), position)
+        if milestone:
+            self._draw(state, position, milestone, board)
+        self._said = self._figures(row)
+
+    def _names(self, state: TabularState) -> dict[str, float]:
+        return tags_of(self.learner, state.metrics())
+
+    def _tags(self, state: TabularState, position: int, row: Row) -> dict[str, float]:
+        # A solver has proven nothing at step 0; TensorBoard's band chart wants the same steps in all its tags.
+        logged = {} if self.learner.needs_model and not position else tags_of(self.learner, row)
+        return {tag: value for tag, value in logged.items() if np.isfinite(value)} | evaluation_tags(self.last)
+
+    def _draw(self, state: TabularState, position: int, title: str, board: Board) -> None:
+        if not self.settings.pictures:
+            return
+        grid = grid_pictures.grid_of(self.problem.env)
+        heading = f"policy, {title}" if position else title
+        board.picture("policy", grid_pictures.policy_picture(state.policy.cpu().numpy(), grid, heading), position)
+        if position and state.reward_bias is not None:
+            bias = state.reward_bias.cpu().numpy()
+            board.picture("reward_bias", grid_pictures.bias_picture(bias, grid, f"reward bias, {title}"), position)
+
+    def _figures(self, row: Row) -> str:
+        if "theta_lower" in row:
+            # A biasing iteration's own theta is optimistic: below theta* until the last.
+            text = f"theta {row['theta']:.10f}  {proven((row['theta_lower'], row['theta_upper']), None)}  "
+        else:
+            text = f"rho {row['rho']:.4e}  " if "rho" in row else ""
+            text += f"theta {row['theta']:.5f}  " if "theta" in row else ""
+        text += f"delta max {row['delta_max']:.4f}  " if "delta_max" in row else ""
+        return f"{text}reward per step {self.last.reward_per_step:.4f}  objective {self.last.objective:.4f}"
+
+    def line(self) -> str:
+        return self._said
+
+    # -- checkpoints ----------------------------------------------------------------------------------
+
+    def content(self) -> Content:
+        return {"first": self.first, "last": self.last, "evaluation": self.rng.bit_generator.state}
+
+    def restore(self, content: Content) -> None:
+        self.first = content["first"]
+        self.back(content)
+
+    def mark(self) -> Content:
+        return {"last": self.last, "evaluation": self.rng.bit_generator.state}
+
+    def back(self, mark: Content) -> None:
+        self.last = mark["last"]
+        self.rng.bit_generator.state = mark["evaluation"]
+
+    # -- the end --------------------------------------------------------------------------------------
+
+    def finish(self, outcome: Outcome[TabularState], solution: Solution, board: Board) -> Solution:
+        stopped, position = outcome.stopped, self.learner.position(outcome.state)
+        if isinstance(stopped, Exception) and not isinstance(stopped, NonFiniteError):
+            solution = replace(solution, message=f"{type(stopped).__name__}: {stopped}")
+        if self.optimum is not None:
+            assert self.model is not None
+            solution = certify(solution, self.model, self.learner.beta, self.problem.prior, self.optimum)
+        else:
+            for step in (0, position):
+                board.scalars(self._optimal(solution), step)
+        exact = (self.last.objective, self.first.objective) if self.model is not None else (np.nan, np.nan)
+        noted = reservations.of_outcome(solution.status, solution.message, *exact)
+        if self.counts is not None:
+            noted += reservations.of_theta(solution.theta, self.counts.tally.reward_range, self.estimate)
+        for _, text in noted:
+            note(text)
+        rate = position / max(outcome.seconds, 1e-9)
+        board.scalars({f"time/{self.learner.unit}_per_second": rate}, position)
+        final = {"theta": solution.theta, "gap": solution.gap}
+        ends = {f"Final/{name}": value for name, value in final.items() if value is not None}
+        board.scalars(evaluation_tags(self.last, "Final") | ends, position)
+        return solution
+
+    def save(self, solution: Solution, directory: Path) -> None:
+        solution.save(directory / "solution.npz")
+
+    def failed(self, solution: Solution) -> None:
+        """The error has ended the run already."""
+
+    def result(self, outcome: Outcome[TabularState], solution: Solution) -> dict[str, Any]:
+        n_experience = 0 if self.experience is None else len(self.experience)
+        estimate, counts = self.estimate, self.counts
+        away = reservations.half_widths(solution.theta, estimate)
+        data = None
+        if estimate is not None:
+            data = f"nothing: {estimate.withheld}" if np.isnan(estimate.value) else str(estimate)
+        states_met = None
+        if estimate is not None and counts is not None:
+            visits = counts.tally.visits.reshape(self.problem.n_states, self.problem.n_actions)
+            states_met = [int(visits.any(1).sum()), self.problem.n_states]
+        rho = solution.rho if solution.rho and solution.rho < np.inf else None  # beyond double precision: theta tells
+        return {
+            "env": self.title.env,
+            "learner": self.title.learner,
+            "beta": float(self.learner.beta),
+            "seed": self.title.seed,
+            "status": solution.status.name.lower(),
+            "message": solution.message,
+            "theta": solution.theta,
+            "rho": rho,
+            "reward_bias_max": solution.reward_bias_max,
+            "reward_per_step": self.last.reward_per_step,
+            "objective": self.last.objective,
+            "return": self.last.mean_return,
+            "theta_bounds": list(solution.theta_bounds) if solution.theta_bounds else None,
+            "gap": solution.gap,
+            "k": solution.k,
+            "n_experience": n_experience,
+            f"n_{self.learner.unit}": solution.n_steps,
+            "seconds_learning": round(outcome.seconds, 3),
+            "versions": versions(),
+            "data": data,
+            "data_smallest_visits": None if estimate is None or estimate.withheld else estimate.smallest_visits,
+            "data_states": states_met,
+            "data_half_widths": away if np.isfinite(away) else None,
+            "n_skipped": self.n_skipped,
+        }
+
+    def summary(self, result: Mapping[str, Any], directory: Path) -> str:
+        first, last = self.first, self.last
+        of_play = "" if self.model is not None else "  (the prior's: an estimate, of the episodes played)"
+        theta, rho = result["theta"], result["rho"]
+        rows = [] if theta is None else [("theta", f"{-first.objective:12.5f}", f"{theta:12.5f}{of_play}")]
+        if rho is not None and "rho" in self.start.metrics():
+            rows.append(("rho", f"{'-':>12}", f"{rho:12.4e}"))
+        rows += [
+            ("reward per step", f"{first.reward_per_step:12.5f}", f"{last.reward_per_step:12.5f}"),
+            ("objective", f"{first.objective:12.5f}", f"{last.objective:12.5f}"),
+            ("episode return", f"{first.mean_return:12.2f}", f"{last.mean_return:12.2f}"),
+        ]
+        heading = f"{self.title.env}, {self.title.learner}, beta {self.learner.beta:g}, seed {self.title.seed}"
+        lines = [
+            *headline(heading, result),
+            f"{'':18}{'prior':>12}{'learnt':>12}",
+            *(f"{name:18}{before}{after}" for name, before, after in rows),
+        ]
+        if result["theta_bounds"] is not None:
+            lines.append(f"{'proven':18}{proven(result['theta_bounds'], result['gap'])}")
+        if result["data"]:
+            lines.append(f"{'the data say':18}{result['data']}{_reach_of_data(result)}")
+        done = result[f"n_{self.learner.unit}"]
+        if result["n_experience"]:
+            rate = done / max(result["seconds_learning"], 1e-3) / 1e6
+            lines.append(f"{'tuples streamed':18}{done:,} (of {result['n_experience']:,}; {rate:.3g} M/s)")
+        else:
+            k = "" if result["k"] is None else f" (k = {result['k']})"
+            lines.append(f"{'iterations':18}{done}{k}")
+        return "\n".join([*lines, *last_rows(result, directory)])
+
+
+def tags_of(learner: TabularLearner[Any], row: Row) -> dict[str, float]:
+    """What the learner logs, by tag."""
+    prefix = "exact" if learner.needs_model else "s1" if "psi_error" in row else "learner"
+    return {f"{prefix}/{name}": value for name, value in row.items() if name not in ("epoch", "n_tuples")}
+
+
+def _reach_of_data(result: Mapping[str, Any]) -> str:
+    """What the interval of the data rests on, and how far the learnt theta is from it."""
+    fewest, away, met = result["data_smallest_visits"], result["data_half_widths"], result["data_states"]
+    text = ""
+    if fewest is not None:
+        states = "" if met is None or met[0] == met[1] else f"{met[0]:,} of {met[1]:,} states met, "
+        text = f" (95%; {states}{fewest} visit{'s' * (fewest != 1)} or more of each pair that counts)"
+    return text + (f"; learnt: {away:.2f} half widths from its middle" if away is not None and away > 1 else "")
