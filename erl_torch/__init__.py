@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from erl_torch.experience.transitions import Transitions
     from erl_torch.learners.certainty_equivalence import CertaintyEquivalence
     from erl_torch.learners.efficient_s1.algorithm import EfficientS1
-    from erl_torch.learners.learner import NonFiniteError
+    from erl_torch.learners.learner import NonFiniteError, Streaming
     from erl_torch.learners.replicas import Replicas, ReplicaSolution
     from erl_torch.learners.s1.algorithm import AlgorithmS1, ListedS1, S1State
     from erl_torch.mdp.from_gymnasium import MeanRewardWarning, tabular_mdp
@@ -58,6 +58,7 @@ _HOME = {
     "Simulation": "experience.simulation",
     "Solution": "solution",
     "Source": "experience.sources",
+    "Streaming": "learners.learner",
     "bootstrap_theta": "empirical.uncertainty",
     "certify": "solvers",
     "iterate_biasing": "solvers",
@@ -105,6 +106,7 @@ __all__ = [
     "Solution",
     "Source",
     "Status",
+    "Streaming",
     "TabularMDP",
     "Transitions",
     "bootstrap_theta",

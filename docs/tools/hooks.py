@@ -36,6 +36,7 @@ def on_files(files: Any, config: Any, **_: Any) -> Any:
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     markdown = re.sub(r"^<!-- README: (.+?) -->$", lambda found: _section(found[1]), markdown, flags=re.M)
+    markdown = re.sub(r"^<!-- file: (\S+) -->$", lambda found: _code(found[1]), markdown, flags=re.M)
     markdown = markdown.replace("<!-- examples -->", _examples())
     here = (ROOT / "docs" / page.file.src_uri).parent
 
@@ -48,6 +49,11 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     parts = FENCE.split(markdown)
     parts[::2] = [re.sub(r"(?<!!)\[([^\]]*)\]\((?!\w+:|#)([^)\s]+)\)", link, part) for part in parts[::2]]
     return "".join(parts)
+
+
+def _code(path: str) -> str:
+    """A Python file of the tree, in full."""
+    return f"```python title=\"{Path(path).name}\"\n{(ROOT / path).read_text()}```"
 
 
 def on_page_content(html_text: str, **_: Any) -> str:

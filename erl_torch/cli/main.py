@@ -264,7 +264,6 @@ def _resumed(arguments: list[str]) -> list[str]:
     return [*began, *others, "hydra.run.dir='{}'".format(str(directory).replace("'", "\\'")), *options]
 
 
-
 def _by_id(argument: str, conf: Path) -> list[str]:
     """env=ID for env=NAME: the configuration with that id, or any environment of Gymnasium's."""
     match = re.fullmatch(r"env=((?:[\w.:-]+/)?[\w.:-]+-v\d+)", argument)

@@ -93,4 +93,4 @@ def _of_files(typed: Sequence[str]) -> set[str]:
     """The classes in the files of a --config-dir that is ``typed``."""
     folder = config_dir(typed)
     files = [path for group in GROUPS for path in sorted((folder / group).glob("*.yaml"))] if folder else []
-    return {str(OmegaConf.load(path).get("class")) for path in files}  # type: ignore[union-attr]
+    return {str(OmegaConf.select(OmegaConf.load(path), "class")) for path in files}

@@ -24,11 +24,12 @@ from erl_torch.experience.simulation import KEEP_BYTES, TUPLE_BYTES, ReplicaExpe
 from erl_torch.experience.sources import Source
 from erl_torch.experience.transitions import Transitions, join
 from erl_torch.files import read_npy
+from erl_torch.learners.learner import Learner
 from erl_torch.mdp.from_gymnasium import MeanRewardWarning, absorbing, known_mdp, sizes, tabular_mdp
 from erl_torch.mdp.tabular import TabularMDP, check_policy
 from erl_torch.notes import note
 from erl_torch.problem import Problem
-from erl_torch.run.classes import OF_EVERY_ENV, resolve, settings_of
+from erl_torch.run.classes import OF_EVERY_ENV, parameters, resolve, settings_of
 
 SafePoint = Callable[[], None]
 TABLES = 8  # of a learner's size, about, while it learns and is evaluated
@@ -36,7 +37,7 @@ REPLICA_BYTES = 10_000  # of a replica, besides: generators and settings
 LABELS = ("class", "name")  # keys of every group that are no arguments
 OF_THE_MODEL = ("stream", "n_samples", "model_seed")  # of a control task
 OF_NO_ENV = (*LABELS, "id", "suggest", *OF_THE_MODEL, *OF_EVERY_ENV)
-LEARNER_METHODS = ("init", "iterate", "solution")
+CONTRACT = [name for name in {**vars(Learner), **Learner.__annotations__} if not name.startswith("_")]
 
 
 class World(NamedTuple):
@@ -168,7 +169,7 @@ def make_problem(cfg: DictConfig, env: gym.Env[Any, Any], world: World, learner:
 def learner_class(cfg: DictConfig, key: str = "learner") -> Any:
     """The class of the learner of ``cfg``. Raises InputError, under ``key``."""
     kind = resolve(cfg.get("class"), f"{key}.class")
-    absent = [name for name in LEARNER_METHODS if not hasattr(kind, name)]
+    absent = [name for name in CONTRACT if not hasattr(kind, name) and name not in parameters(kind)]
     if absent:
         raise InputError(f"{key}.class", cfg["class"], f"that of a learner: it has no {', '.join(absent)}")
     return kind

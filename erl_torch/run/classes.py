@@ -18,7 +18,12 @@ from erl_torch.checks import InputError, out_of_memory
 from erl_torch.run.settings import KINDS
 
 GROUPS = ("env", "learner", "experience")  # of which a configuration can name the class
-NODES = {"float": FloatNode, "int": IntegerNode, "bool": BooleanNode, "str": StringNode}
+NODES: dict[str, type[FloatNode | IntegerNode | BooleanNode | StringNode]] = {
+    "float": FloatNode,
+    "int": IntegerNode,
+    "bool": BooleanNode,
+    "str": StringNode,
+}
 OF_EVERY_ENV = {"use_model": True, "on_end": "restart", "bins": None, "low": None, "high": None, "actions": None}
 
 
