@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from erl_torch.empirical.uncertainty import Estimate, bootstrap_theta, policy_uncertainty, theta_uncertainty
     from erl_torch.envs.estimate import EstimatedModel, estimate_mdp
     from erl_torch.evaluation import Evaluation, evaluate
-    from erl_torch.experience.collect import collect, record
+    from erl_torch.experience.collect import collect
     from erl_torch.experience.experience import Experience
-    from erl_torch.experience.recording import FileRecording, open_recording, save_columns
+    from erl_torch.experience.recording import read_experience, write_experience
     from erl_torch.experience.rollouts import collect_rollouts, rollout
     from erl_torch.experience.simulation import Simulation
     from erl_torch.experience.transitions import Transitions
@@ -43,7 +43,6 @@ _HOME = {
     "EfficientS1": "learners.efficient_s1.algorithm",
     "EmpiricalMDP": "empirical.counts",
     "Estimate": "empirical.uncertainty",
-    "FileRecording": "experience.recording",
     "Experience": "experience.experience",
     "Evaluation": "evaluation",
     "InputError": "checks",
@@ -67,9 +66,8 @@ _HOME = {
     "TabularMDP": "mdp.tabular",
     "Transitions": "experience.transitions",
     "collect": "experience.collect",
-    "open_recording": "experience.recording",
-    "record": "experience.collect",
-    "save_columns": "experience.recording",
+    "read_experience": "experience.recording",
+    "write_experience": "experience.recording",
     "collect_rollouts": "experience.rollouts",
     "estimate_mdp": "envs.estimate",
     "evaluate": "evaluation",
@@ -79,7 +77,13 @@ _HOME = {
     "theta_uncertainty": "empirical.uncertainty",
 }
 
-_RENAMED = {"Recording": Renamed("experience.experience", "Experience", "erl_torch.Experience")}
+_RENAMED = {
+    "FileRecording": Renamed("experience.recording", "FileRecording", "erl_torch.read_experience"),
+    "Recording": Renamed("experience.experience", "Experience", "erl_torch.Experience"),
+    "open_recording": Renamed("experience.recording", "read_experience", "erl_torch.read_experience"),
+    "record": Renamed("experience.collect", "record", "erl_torch.collect(..., save_to=DIRECTORY)"),
+    "save_columns": Renamed("experience.recording", "write_experience", "erl_torch.write_experience"),
+}
 
 __all__ = [
     "AlgorithmS1",
@@ -90,7 +94,6 @@ __all__ = [
     "EstimatedModel",
     "Evaluation",
     "Experience",
-    "FileRecording",
     "InputError",
     "ListedS1",
     "MeanRewardWarning",
@@ -112,16 +115,15 @@ __all__ = [
     "estimate_mdp",
     "evaluate",
     "iterate_biasing",
-    "open_recording",
     "perron",
     "policy_uncertainty",
-    "record",
+    "read_experience",
     "rollout",
-    "save_columns",
     "solve_biasing",
     "solve_soft_bellman",
     "tabular_mdp",
     "theta_uncertainty",
+    "write_experience",
 ]
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from erl_torch import checks
-from erl_torch.experience.experience import Experience
+from erl_torch.experience.experience import EXPERIENCE, Experience
 from erl_torch.solution import Solution
 
 
@@ -28,7 +28,7 @@ def epochs(learner: Any, transitions: Experience, n_states: int, n_actions: int,
 
     Raises what its ``step`` raises.
     """
-    checks.instance("transitions", transitions, Experience, "a recording, as of Transitions or open_recording")
+    checks.instance("transitions", transitions, Experience, EXPERIENCE)
     stream = learner.prepare(transitions, n_states, n_actions)
     state = learner.init(n_states, n_actions) if state is None else state
     while not learner.finished(state):

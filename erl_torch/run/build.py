@@ -17,9 +17,9 @@ from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.envs.discretise import Discretise
 from erl_torch.envs.estimate import estimate_mdp
-from erl_torch.experience.collect import collect, record
+from erl_torch.experience.collect import collect
 from erl_torch.experience.experience import Experience
-from erl_torch.experience.recording import FileRecording, check_target, open_recording
+from erl_torch.experience.recording import FileRecording, check_target
 from erl_torch.files import read_npy
 from erl_torch.learners import LEARNERS
 from erl_torch.mdp.from_gymnasium import MeanRewardWarning, absorbing, known_mdp, tabular_mdp
@@ -217,7 +217,7 @@ def collected_experience(
         with _collecting("collecting", total, safe_point) as report:
             arguments = cfg.n_episodes, cfg.episode_length, rng, behaviour, prior, report
             if cfg.save_to is not None and cfg.save_to.endswith("/"):
-                return open_recording(record(source, cfg.save_to, *arguments), n_states, n_actions)
+                return collect(source, *arguments, save_to=str(cfg.save_to))
             data = collect(source, *arguments)
         if cfg.save_to is not None:
             check_target("save_to", cfg.save_to)  # again: the collecting may have taken hours

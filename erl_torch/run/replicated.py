@@ -33,7 +33,7 @@ from erl_torch.empirical.reservations import Counted, Reservation
 from erl_torch.empirical.uncertainty import Estimate
 from erl_torch.evaluation import Judge, evaluate
 from erl_torch.experience.collect import COLUMN_BYTES, collect
-from erl_torch.experience.recording import check_target, save_columns
+from erl_torch.experience.recording import check_target, write_experience
 from erl_torch.experience.simulation import KEEP_BYTES, TUPLE_BYTES, ReplicaExperience, Simulation
 from erl_torch.experience.transitions import Transitions
 from erl_torch.files import read_npy, write_json, write_png
@@ -333,7 +333,7 @@ def _experience(
         data = collect(world.source, e.n_episodes, e.episode_length, cfg.seed, behaviour, prior)
         if e.save_to is not None:
             check_target("experience.save_to", e.save_to)
-            save_columns(data, e.save_to) if e.save_to.endswith("/") else data.save(e.save_to)
+            write_experience(data, e.save_to) if e.save_to.endswith("/") else data.save(e.save_to)
         return data
     mdp = known_mdp(world.source)
     if mdp is not None:
