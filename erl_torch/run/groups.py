@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 
 from erl_torch import checks, pictures
 from erl_torch.checks import InputError
+from erl_torch.learners.learner import StreamLearner
 from erl_torch.log.tensorboard import Board
 
 QUANTITIES = {
@@ -72,6 +73,22 @@ def groups_of(vary: Mapping[str, Any], n_replicas: int, settings: Mapping[str, A
         members = slice(i * n_replicas, (i + 1) * n_replicas)
         groups.append(Group(varied, members, float(varied.get("beta", settings["beta"]))))
     return groups
+
+
+def groups_among(learners: Sequence[StreamLearner[Any, Any]]) -> tuple[list[Group], dict[str, list[float]]]:
+    """Neighbours with the same settings; and the values of each number that varies, by its name."""
+    numbers = [
+        {f.name: getattr(learner, f.name) for f in fields(learner) if checks.is_number(getattr(learner, f.name))}
+        for learner in learners
+    ]
+    names = [name for name in numbers[0] if any(row.get(name) != numbers[0][name] for row in numbers)]
+    settings = [{name: row[name] for name in names} for row in numbers]
+    starts = [r for r in range(len(learners)) if r == 0 or settings[r] != settings[r - 1]]
+    groups = [
+        Group(settings[first], slice(first, last), float(learners[first].beta))
+        for first, last in zip(starts, [*starts[1:], len(learners)], strict=True)
+    ]
+    return groups, {name: list(dict.fromkeys(group.settings[name] for group in groups)) for name in names}
 
 
 def statistics(values: np.ndarray) -> dict[str, float]:

@@ -20,7 +20,7 @@ from erl_torch.experience.collect import COLUMN_BYTES
 from erl_torch.experience.simulation import KEEP_BYTES, ReplicaExperience, Simulation
 from erl_torch.experience.transitions import Transitions
 from erl_torch.files import write_png
-from erl_torch.learners.learner import NonFiniteError, Streaming
+from erl_torch.learners.learner import NonFiniteError, StreamLearner
 from erl_torch.learners.replicas import Replicas, ReplicaSolution, ReplicaState
 from erl_torch.log.tensorboard import Board, Boards, replica_layout
 from erl_torch.mdp.tabular import TabularMDP, check_policy
@@ -338,7 +338,7 @@ class Data(NamedTuple):
 
 def reservations_of(
     experience: ReplicaExperience,
-    learners: Sequence[Streaming[Any, Any]],
+    learners: Sequence[StreamLearner[Any, Any]],
     prior: np.ndarray,
     model: TabularMDP | None,
     certify: bool,
@@ -348,7 +348,7 @@ def reservations_of(
     Theta is not held against the model's."""
     shape = prior.shape
 
-    def data_of(here: Counted, learner: Streaming[Any, Any]) -> Data:
+    def data_of(here: Counted, learner: StreamLearner[Any, Any]) -> Data:
         return Data(here.tally.reward_range, of_data(here.model, learner.beta, prior) if certify else None)
 
     if isinstance(experience, Simulation):  # of the model itself: it is not held against the model
