@@ -7,6 +7,7 @@ import resource
 from dataclasses import fields
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -69,7 +70,7 @@ OF_A_CLASS = [path for group in classes.GROUPS for path in sorted((CONF / group)
 @pytest.mark.parametrize("path", OF_A_CLASS, ids=lambda path: f"{path.parent.name}/{path.stem}")
 def test_keys_are_the_arguments_of_the_class(path):
     """All of them, and besides those that tell where it is and what suits it."""
-    text = OmegaConf.load(path)
+    text: Any = OmegaConf.load(path)
     keys = set(text) - {"defaults", "class", "name", "id", "suggest", *OF_THE_MODEL}
     if "class" in text:
         kind = classes.resolve(text["class"], "class")

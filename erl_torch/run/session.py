@@ -132,9 +132,7 @@ def train(
         if many:
             experience, seeds = _of_replicas(learner, given, experience, seed)
             groups, vary = groups_among(learner.learners)
-            recorder = ReplicaRecorder(
-                learner, given, experience, groups, seeds, vary, settings, title, lambda: None
-            )
+            recorder = ReplicaRecorder(learner, given, experience, groups, seeds, vary, settings, title, lambda: None)
             n_experience = recorder.n_experience
         else:
             if isinstance(experience, Source):
@@ -149,7 +147,7 @@ def train(
             recorder=recorder,
             saved=saved,
             hyperparameters=hyperparameters(described, n_experience=n_experience),
-            texts={"configuration": f"```yaml\n{yaml.safe_dump(described, sort_keys=False)}```"},
+            configuration=yaml.safe_dump(described, sort_keys=False),
             every=settings.every,
             talks=talks,
             safe_point=lambda: None,
