@@ -30,7 +30,7 @@ from erl_torch import AlgorithmS1, CertaintyEquivalence, EfficientS1, Transition
 from erl_torch.empirical import reservations
 from erl_torch.envs.windy_cliff import WindyCliffEnv
 from erl_torch.experience.experience import Experience
-from erl_torch.experience.recording import ColumnWriter, open_recording
+from erl_torch.experience.recording import ColumnWriter, read_experience
 from erl_torch.learners.s1 import kernels, listing
 from erl_torch.learners.s1.algorithm import S1Stream
 
@@ -165,7 +165,7 @@ def bench_notes() -> None:
             writer.append(collect(env, 5000, 1000, 0))
         streams: dict[str, Experience] = {
             "500,000 tuples, simulated": held,
-            "5,000,000 tuples, recorded": open_recording(f"{directory}/tuples/", 15, 4),
+            "5,000,000 tuples, recorded": read_experience(f"{directory}/tuples/", 15, 4),
         }
         for name, data in streams.items():
             for which, learner in learners.items():

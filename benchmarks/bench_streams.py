@@ -20,8 +20,10 @@ from typing import Any
 
 import torch
 
-from erl_torch import AlgorithmS1, CertaintyEquivalence, FileRecording, collect, record
+from erl_torch import AlgorithmS1, CertaintyEquivalence, collect
 from erl_torch.envs.windy_cliff import WindyCliffEnv
+from erl_torch.experience.collect import record
+from erl_torch.experience.recording import FileRecording
 from erl_torch.learners import DifferentialSoftQ
 
 IN_MEMORY = 20_000_000

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -12,7 +13,8 @@ import scipy.sparse as sp
 from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.experience import kernels as experience_kernels
-from erl_torch.experience.collect import batched, reset
+from erl_torch.experience.collect import batched
+from erl_torch.experience.play import draw_action, episode, reset
 from erl_torch.experience.sampling import policy_cdf, sampling_tables
 from erl_torch.mdp.from_gymnasium import known_mdp, sizes
 from erl_torch.mdp.tabular import TabularMDP, check_policy, check_prior
@@ -156,18 +158,12 @@ def _evaluate_by_playing(
     if batch is not None:
         data = batch(n_episodes, horizon, seed=Streams(rng, rng, rng), behaviour_policy=policy, reward="original")
         return Evaluation(data.r.sum() / n_episodes, data.r.mean(), float((data.r - kl[data.s] / beta).mean()))
-    cdf = np.cumsum(policy, axis=1)
+    choose = partial(draw_action, np.cumsum(policy, axis=1), rng)
     total = total_kl = 0.0
     n_steps = 0
     for _ in range(n_episodes):
-        s = reset(env, rng)
-        for _ in range(horizon):
-            a = int(np.searchsorted(cdf[s], rng.random() * cdf[s, -1], side="right"))
-            observation, reward, terminated, truncated, _ = env.step(a)
-            total += float(reward)
-            total_kl += kl[s]
+        for step in episode(env, reset(env, rng), choose, horizon):
+            total += step.r
+            total_kl += kl[step.s]
             n_steps += 1
-            s = int(observation)
-            if terminated or truncated:
-                break
     return Evaluation(total / n_episodes, total / n_steps, float(total - total_kl / beta) / n_steps)

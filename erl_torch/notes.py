@@ -30,8 +30,8 @@ def note(text: str) -> None:
 
 
 @contextlib.contextmanager
-def collected() -> Iterator[list[str]]:
-    """Collect the notes given inside the block, in order and without repetition; print each as it comes."""
+def collected(print_them: bool = True) -> Iterator[list[str]]:
+    """Collect the notes given inside the block, in order and without repetition; print each as it comes, if asked."""
     notes: list[str] = []
     with warnings.catch_warnings():
         warnings.simplefilter("always", Note)
@@ -49,7 +49,8 @@ def collected() -> Iterator[list[str]]:
                 show_other(message, category, filename, lineno, file, line)
             elif str(message) not in notes:
                 notes.append(str(message))
-                print(f"note: {message}", file=sys.stderr)
+                if print_them:
+                    print(f"note: {message}", file=sys.stderr)
 
         warnings.showwarning = show
         yield notes

@@ -29,7 +29,7 @@ class SweepState:
 
 
 @dataclass(frozen=True)
-class SoftValueIteration(erl_torch.Streaming):
+class SoftValueIteration(erl_torch.StreamLearner):
     states: ClassVar = (SweepState,)  # what a checkpoint may hold
     beta: float = 10.0
     n_epochs: int = 400

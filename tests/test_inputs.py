@@ -256,7 +256,7 @@ def test_numbers_of_numpy_count_as_python_s():
     learner = AlgorithmS1(beta=np.float32(2.5), lr_u=1, n_epochs=np.int8(2), n_bias=np.int64(1), clip_rho=np.True_)
     kinds = {"beta": float, "lr_u": float, "n_epochs": int, "n_bias": int, "clip_rho": bool}
     assert {name: type(getattr(learner, name)) for name in kinds} == kinds
-    assert len(collect(MDP, np.int8(100), np.int8(100))) == 10_000
+    assert len(collect(MDP, np.int8(100), np.int8(100))) == 10_000  # type: ignore[call-overload]
     assert Simulation(MDP, np.int8(100), np.int8(100), [0]).n_tuples == 10_000
     with pytest.raises(InputError, match=r"^clip_rho=1 \(int\): must be True or False"):
         AlgorithmS1(clip_rho=1)

@@ -7,7 +7,13 @@ import pytest
 
 import erl_torch
 
-TODAY = {"Recording": "erl_torch.experience.experience.Experience"}
+TODAY = {
+    "FileRecording": "erl_torch.experience.recording.FileRecording",
+    "Recording": "erl_torch.experience.experience.Experience",
+    "open_recording": "erl_torch.experience.recording.read_experience",
+    "record": "erl_torch.experience.collect.record",
+    "save_columns": "erl_torch.experience.recording.write_experience",
+}
 
 
 @pytest.mark.parametrize("old", TODAY)

@@ -3,6 +3,7 @@
 import multiprocessing
 import signal
 from functools import partial
+from typing import Any
 
 import pytest
 
@@ -24,7 +25,7 @@ def test_a_failure_ends_jobs_that_never_end():
 
 
 def test_who_stops_asking_ends_jobs_that_never_end():
-    work = parallel.results({"ends": partial(pow, 3, 2), "waits": FOR_EVER}, 2)
+    work: Any = parallel.results({"ends": partial(pow, 3, 2), "waits": FOR_EVER}, 2)
     assert next(work) == ("ends", 9)
     work.close()
     assert multiprocessing.active_children() == []

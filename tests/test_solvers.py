@@ -221,7 +221,7 @@ def test_exact_learner_with_nothing_to_iterate(method):
     mdp = TabularMDP([[1.0], [1.0]], [[-1.0, -3.0]])
     learner = Exact(beta=1.0, method=method)
     states = list(learner.iterate(mdp))
-    solution = learner.solution(mdp, states[-1], [s.metrics() for s in states], False)
+    solution = learner.solution(states[-1], [s.metrics() for s in states])
     assert solution.status is Status.CONVERGED
     assert solution.theta == pytest.approx(-np.log(0.5 * (np.exp(-1) + np.exp(-3))), abs=1e-10)
 

@@ -18,20 +18,19 @@ from erl_torch import (
     AlgorithmS1,
     CertaintyEquivalence,
     EfficientS1,
-    FileRecording,
     InputError,
     ListedS1,
     Replicas,
     Transitions,
     collect,
-    open_recording,
-    record,
-    save_columns,
+    read_experience,
+    write_experience,
 )
 from erl_torch.empirical.counts import empirical_mdp, tally
 from erl_torch.envs.discretise import Discretise
+from erl_torch.experience.collect import record
 from erl_torch.experience.experience import Parts
-from erl_torch.experience.recording import ColumnWriter, _Minari, check_target
+from erl_torch.experience.recording import ColumnWriter, FileRecording, _Minari, check_target
 from erl_torch.experience.transitions import COLUMNS, regroup
 from erl_torch.learners import LEARNERS
 from erl_torch.rng import streams
@@ -74,7 +73,7 @@ def written(folder, data, kind):
     if kind == "npz":
         return data.save(path)
     if kind == "columns":
-        return save_columns(data, path)
+        return write_experience(data, path)
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -118,13 +117,13 @@ def test_learners_do_not_see_how_a_stream_is_cut(name):
 def test_files_are_the_stream_in_memory(tmp_path, kind):
     path = written(tmp_path, NOISY, kind)
     for rows in (1000, len(NOISY) - 1):
-        found = open_recording(path, 5, 3, chunk=rows)
+        found = read_experience(path, 5, 3, chunk=rows)
         assert isinstance(found, FileRecording)
         assert (len(found), found.checksum()) == (len(NOISY), NOISY.checksum())
         assert found.load().checksum() == NOISY.checksum()
         for name in ("s1", "certainty_equivalence", "s1_efficient", "differential_soft_q"):
             same(LEARN[name].fit(found, 5, 3), LEARN[name].fit(NOISY, 5, 3))
-    assert isinstance(open_recording(path, 5, 3), Transitions)
+    assert isinstance(read_experience(path, 5, 3), Transitions)
     path = written(tmp_path, SHORT, kind)
     for rows in (1, 7):
         found = FileRecording(path, 5, 3, chunk=rows)
@@ -207,7 +206,7 @@ def test_missing_values_of_parquet_are_bad_tuples(tmp_path):
 
 
 def test_short_and_damaged_columns(tmp_path):
-    path = save_columns(PLAIN, tmp_path / "t")
+    path = write_experience(PLAIN, tmp_path / "t")
     whole = (path / "r.npy").read_bytes()
     (path / "r.npy").write_bytes(whole[: 128 + 8 * 9000 + 3])
     with pytest.raises(InputError, match=r"t: r\[9000\]=missing: must be there: 13000 rows are announced"):
@@ -229,7 +228,7 @@ def test_short_and_damaged_columns(tmp_path):
     (path / "r.npy").unlink()
     with pytest.raises(InputError, match=r"lacks r\.npy"):
         FileRecording(path, 5, 3)
-    path = save_columns(PLAIN, tmp_path / "floats")
+    path = write_experience(PLAIN, tmp_path / "floats")
     np.save(path / "s.npy", PLAIN.s.astype(float))
     with pytest.raises(InputError, match="s=dtype float64: must be a column of whole numbers"):
         FileRecording(path, 5, 3, on_bad="skip")
@@ -237,14 +236,14 @@ def test_short_and_damaged_columns(tmp_path):
 
 def test_refusals(tmp_path):
     with pytest.raises(InputError, match=r"none\.npz: must be there: an npz or Parquet file"):
-        open_recording(tmp_path / "none.npz", 5, 3)
+        read_experience(tmp_path / "none.npz", 5, 3)
     path = written(tmp_path, PLAIN, "npz")
     with pytest.raises(InputError, match="on_bad=ignore"):
-        open_recording(path, 5, 3, on_bad="ignore")
+        read_experience(path, 5, 3, on_bad="ignore")
     with pytest.raises(InputError, match="chunk=0"):
-        open_recording(path, 5, 3, chunk=0)
+        read_experience(path, 5, 3, chunk=0)
     with pytest.raises(InputError, match="0 good tuples"):
-        open_recording(written(tmp_path, Transitions([9], [9], [0.0], [9], [9]), "columns"), 5, 3, on_bad="skip")
+        read_experience(written(tmp_path, Transitions([9], [9], [0.0], [9], [9]), "columns"), 5, 3, on_bad="skip")
     found = FileRecording(path, 5, 3, chunk=1000)
     with pytest.raises(InputError, match="those it was opened with"):
         CertaintyEquivalence().fit(found, 4, 3)
@@ -277,40 +276,40 @@ def test_columns_are_written_whole_or_not_at_all(tmp_path):
         interrupted()
     assert list((tmp_path / "deep").iterdir()) == []
     assert record(MDP, path, 13, 1000, 1) == path
-    assert open_recording(path, 5, 3).checksum() == PLAIN.checksum()
+    assert read_experience(path, 5, 3).checksum() == PLAIN.checksum()
     assert np.array_equal(np.load(path / "s_next.npy", mmap_mode="r"), PLAIN.s_next)
-    save_columns(Cut(PLAIN, 999), path)
-    assert open_recording(path, 5, 3).checksum() == PLAIN.checksum()
-    save_columns(SHORT, path)  # replaced
-    assert len(open_recording(path, 5, 3)) == 40
+    write_experience(Cut(PLAIN, 999), path)
+    assert read_experience(path, 5, 3).checksum() == PLAIN.checksum()
+    write_experience(SHORT, path)  # replaced
+    assert len(read_experience(path, 5, 3)) == 40
     assert [p.name for p in (tmp_path / "deep").iterdir()] == ["t"]
     (path / "notes.txt").write_text("mine")
     with pytest.raises(InputError, match="what is there is none"):
-        save_columns(SHORT, path)
+        write_experience(SHORT, path)
     assert (path / "notes.txt").exists()
 
 
 def test_recording_moves_the_generators_as_collecting_does(tmp_path):
     behaviour = np.full((5, 3), 1 / 3)
     draws = []
-    for work in (collect, lambda source, *rest: record(source, tmp_path / "t", *rest)):
+    for work in (collect, lambda source, *rest: collect(source, *rest, save_to=tmp_path / "t")):
         rng = streams(3)
         work(MDP, 4, 250, rng, behaviour)
         draws.append([generator.random() for generator in rng])
     assert draws[0] == draws[1]
-    assert open_recording(tmp_path / "t", 5, 3).checksum() == collect(MDP, 4, 250, 3, behaviour).checksum()
+    assert read_experience(tmp_path / "t", 5, 3).checksum() == collect(MDP, 4, 250, 3, behaviour).checksum()
 
 
 @pytest.mark.parametrize("vector", [False, True])
 def test_environments_are_recorded_piece_by_piece(tmp_path, vector):
     made = [gym.make_vec("FrozenLake-v1", 3) if vector else gym.make("FrozenLake-v1") for _ in range(2)]
     reported = []
-    record(made[0], tmp_path / "t", 220 if vector else 1600, 50, 0, report=reported.append)
+    saved = collect(made[0], 220 if vector else 1600, 50, 0, report=reported.append, save_to=tmp_path / "t")
     data = collect(made[1], 220 if vector else 1600, 50, 0)
     assert len(data) > 10_000
     assert len(reported) > 1
     assert reported[-1] == len(data)
-    assert open_recording(tmp_path / "t", 16, 4).checksum() == data.checksum()
+    assert saved.checksum() == read_experience(tmp_path / "t", 16, 4).checksum() == data.checksum()
 
 
 def damaged(rng, folder, kind):
@@ -357,7 +356,7 @@ def refusal(path, on_bad):
     """What is said of a file that is refused; "" if learning from it runs."""
     with contextlib.redirect_stderr(io.StringIO()) as said:
         try:
-            CertaintyEquivalence().fit(open_recording(path, 5, 3, on_bad=on_bad, chunk=64), 5, 3)
+            CertaintyEquivalence().fit(read_experience(path, 5, 3, on_bad=on_bad, chunk=64), 5, 3)
         except InputError as error:
             return str(error)
         finally:
@@ -439,7 +438,7 @@ def test_minari_episodes_become_tuples(tmp_path, monkeypatch):
         )
     prior = np.array([[0.5, 0.25, 0.25]] * 5)
     found = {
-        rows: open_recording("minari:erl/test-v0", 5, 3, on_prior=True, prior_policy=prior, chunk=rows, seed=5)
+        rows: read_experience("minari:erl/test-v0", 5, 3, on_prior=True, prior_policy=prior, chunk=rows, seed=5)
         for rows in (1, 2, 100)
     }
     data = found[100]
@@ -452,12 +451,12 @@ def test_minari_episodes_become_tuples(tmp_path, monkeypatch):
     drawn = (np.cumsum(prior[0]) <= x[:, None]).sum(1)
     assert data.a_next.tolist() == [1, 0, 1, drawn[3], 2, 2]
     assert {found[rows].checksum() for rows in found} == {data.checksum()}
-    other = open_recording("minari:erl/test-v0", 5, 3, prior_policy=prior, seed=5)
+    other = read_experience("minari:erl/test-v0", 5, 3, prior_policy=prior, seed=5)
     assert np.array_equal(other.a_next, drawn)
     with pytest.raises(InputError, match=r"s\[0\]|s_next\[1\]|in \[0, 2\)"):
-        open_recording("minari:erl/test-v0", 2, 3)
+        read_experience("minari:erl/test-v0", 2, 3)
     with pytest.raises(InputError, match="none-v0: must be a readable Minari data set"):
-        open_recording("minari:erl/none-v0", 5, 3)
+        read_experience("minari:erl/none-v0", 5, 3)
 
 
 def test_minari_boxes_are_binned():
@@ -490,7 +489,7 @@ def test_save_to_replaces_recordings_and_nothing_else(tmp_path):
     folder.mkdir()
     (folder / "s.npy").write_text("mine")
     SHORT.save(tmp_path / "elsewhere.npz")
-    save_columns(SHORT, tmp_path / "elsewhere")
+    write_experience(SHORT, tmp_path / "elsewhere")
     link, link_to_columns = tmp_path / "link.npz", tmp_path / "columns"
     link.symlink_to(tmp_path / "elsewhere.npz")
     link_to_columns.symlink_to(tmp_path / "elsewhere")
@@ -511,12 +510,12 @@ def test_save_to_replaces_recordings_and_nothing_else(tmp_path):
     assert kept(tmp_path) == before
     for target in [tmp_path / "new.npz", f"{tmp_path}/new/"] * 2:
         run(target)
-        assert len(open_recording(target, 15, 4)) == 100
+        assert len(read_experience(target, 15, 4)) == 100
     assert not [p for p in tmp_path.iterdir() if p.name.startswith(".")]
 
 
 def test_the_old_recording_stays_until_the_new_one_is_whole(tmp_path, monkeypatch):
-    save_columns(SHORT, tmp_path / "t")
+    write_experience(SHORT, tmp_path / "t")
     before = kept(tmp_path)
     rename = os.rename
 
@@ -528,10 +527,10 @@ def test_the_old_recording_stays_until_the_new_one_is_whole(tmp_path, monkeypatc
     with monkeypatch.context() as patch:
         patch.setattr(os, "rename", failing)
         with pytest.raises(OSError, match="No space left"):
-            save_columns(PLAIN, tmp_path / "t")
+            write_experience(PLAIN, tmp_path / "t")
     assert kept(tmp_path) == before
-    save_columns(PLAIN, tmp_path / "t")
-    assert len(open_recording(tmp_path / "t", 5, 3)) == len(PLAIN)
+    write_experience(PLAIN, tmp_path / "t")
+    assert len(read_experience(tmp_path / "t", 5, 3)) == len(PLAIN)
 
 
 def test_streams_whose_length_shows_late_are_refused_before_they_fill_the_memory(monkeypatch):
@@ -544,4 +543,4 @@ def test_streams_whose_length_shows_late_are_refused_before_they_fill_the_memory
     with pytest.raises(InputError, match="n_episodes=100000000: must be smaller"):
         collect(vector, 10**8, 10**8)
     with pytest.raises(InputError, match="GB of disk, and"):
-        record(MDP, "nowhere/t", 10**10, 10**10)
+        collect(MDP, 10**10, 10**10, save_to="nowhere/t")

@@ -7,7 +7,7 @@ import pytest
 import torch
 from helpers import DATA
 
-from erl_torch import InputError, Transitions, open_recording
+from erl_torch import InputError, Transitions, read_experience
 
 COLUMNS = {
     "s": [0, 1, 2],
@@ -115,7 +115,7 @@ def test_damage_that_leaves_arrays_readable_is_seen(tmp_path, damage, said):
     with pytest.raises(InputError, match=rf"^path=\S*bad.npz: must be a readable npz file .*{said}"):
         Transitions.load(tmp_path / "bad.npz")
     with pytest.raises(InputError, match=r"bad\.npz"):
-        open_recording(tmp_path / "bad.npz", 3, 3)
+        read_experience(tmp_path / "bad.npz", 3, 3)
 
 
 def test_an_array_is_in_a_file_once(tmp_path):
@@ -123,7 +123,7 @@ def test_an_array_is_in_a_file_once(tmp_path):
         for name in ("s.npy", "s"):
             with archive.open(name, "w") as file:
                 np.save(file, np.arange(3))
-    for read in (Transitions.load, lambda path: open_recording(path, 3, 3)):
+    for read in (Transitions.load, lambda path: read_experience(path, 3, 3)):
         with pytest.raises(InputError, match=r"twice\.npz: must be .*\(s is there twice\)"):
             read(tmp_path / "twice.npz")
 

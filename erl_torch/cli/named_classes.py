@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from hydra.core.config_store import ConfigStore
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 from erl_torch.checks import InputError
 from erl_torch.cli.config import composed, config_dir
@@ -93,4 +93,5 @@ def _of_files(typed: Sequence[str]) -> set[str]:
     """The classes in the files of a --config-dir that is ``typed``."""
     folder = config_dir(typed)
     files = [path for group in GROUPS for path in sorted((folder / group).glob("*.yaml"))] if folder else []
-    return {str(OmegaConf.select(OmegaConf.load(path), "class")) for path in files}
+    loaded = [OmegaConf.load(path) for path in files]
+    return {str(node.get("class")) for node in loaded if isinstance(node, DictConfig)}

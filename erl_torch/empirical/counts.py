@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.empirical import kernels
-from erl_torch.experience.experience import Experience
+from erl_torch.experience.experience import EXPERIENCE, Experience
 from erl_torch.mdp.tabular import check_prior, normalise_rows
 from erl_torch.solvers.chains import classes
 from erl_torch.solvers.problem import BellmanProblem
@@ -156,7 +156,7 @@ def tally(data: Experience, n_states: int, n_actions: int, lr_psi: float = 0.0) 
     Raises:
         InputError: naming the first tuple with a state or action out of range.
     """
-    checks.instance("transitions", data, Experience, "a recording, as of Transitions or open_recording")
+    checks.instance("transitions", data, Experience, EXPERIENCE)
     data.check_range(n_states, n_actions)
     n_pairs = n_states * n_actions
     if n_pairs > np.iinfo(np.int32).max:

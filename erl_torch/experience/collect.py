@@ -20,38 +20,67 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.vector import AutoresetMode
+from numpy.typing import ArrayLike
 
 from erl_torch import checks
-from erl_torch.checks import InputError
-from erl_torch.experience.recording import ColumnWriter, save_columns
+from erl_torch.experience.play import Plan, tuples, vector_tuples
+from erl_torch.experience.recording import TYPES, FileRecording, read_experience, write_chunks
 from erl_torch.experience.sampling import Sampler
-from erl_torch.experience.transitions import Transitions, join
+from erl_torch.experience.transitions import COLUMNS, Transitions, join
 from erl_torch.mdp.from_gymnasium import changed_by, known_mdp, sizes
 from erl_torch.mdp.tabular import TabularMDP, check_policy
 from erl_torch.rng import Streams, streams
 
-BLOCK = 1_000_000  # steps a compiled call, so that signals and progress bars are served
+BLOCK = 1_000_000  # steps per compiled call, so that signals and progress bars are served
 TUPLE_BYTES = 32  # of a tuple while it is sampled: two pairs and five columns
 COLUMN_BYTES = 24  # of a tuple in a file, or in memory
 
 Report = Callable[[int], object]
+Source = TabularMDP | gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]
 
 
+@overload
 def collect(
-    source: TabularMDP | gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any],
+    source: Source,
     n_episodes: int,
     episode_length: int,
     seed: int | Streams = 0,
-    behaviour_policy: Any = None,
-    prior_policy: Any = None,
+    behaviour_policy: ArrayLike | None = None,
+    prior_policy: ArrayLike | None = None,
     report: Report | None = None,
-) -> Transitions:
-    """Collect experience.
+    save_to: None = None,
+) -> Transitions: ...
+
+
+@overload
+def collect(
+    source: Source,
+    n_episodes: int,
+    episode_length: int,
+    seed: int | Streams = 0,
+    behaviour_policy: ArrayLike | None = None,
+    prior_policy: ArrayLike | None = None,
+    report: Report | None = None,
+    *,
+    save_to: str | os.PathLike[str],
+) -> Transitions | FileRecording: ...
+
+
+def collect(
+    source: Source,
+    n_episodes: int,
+    episode_length: int,
+    seed: int | Streams = 0,
+    behaviour_policy: ArrayLike | None = None,
+    prior_policy: ArrayLike | None = None,
+    report: Report | None = None,
+    save_to: str | os.PathLike[str] | None = None,
+) -> Transitions | FileRecording:
+    """Collect experience, in memory or in a directory of columns.
 
     Args:
         source: a TabularMDP, or a Gymnasium environment or vector environment with Discrete spaces.
@@ -61,9 +90,51 @@ def collect(
         behaviour_policy: [S, A]; None is the prior.
         prior_policy: [S, A], behind a'; None is uniform.
         report: called with the number of tuples after each block.
+        save_to: a directory that the same tuples are written to, in the memory of one block, whatever their number.
+            (This package's control tasks need the memory of all: their episodes are played at once.)
+
+    Returns:
+        The tuples; with ``save_to``, what ``read_experience`` reads from there.
 
     Raises:
-        InputError: an argument out of range, or spaces that are not Discrete.
+        InputError: an argument out of range, spaces that are not Discrete, tuples that do not fit the memory or the
+            disk, or a directory that holds anything but columns.
+    """
+    arguments = n_episodes, episode_length, seed, behaviour_policy, prior_policy, report
+    if save_to is not None:
+        return read_experience(record(source, save_to, *arguments), *sizes(source))
+    chunks, n = _stream(source, "memory", *arguments)
+    return _filled(chunks, n) if n else join(list(chunks))
+
+
+def record(
+    source: Source,
+    directory: str | os.PathLike[str],
+    n_episodes: int,
+    episode_length: int,
+    seed: int | Streams = 0,
+    behaviour_policy: ArrayLike | None = None,
+    prior_policy: ArrayLike | None = None,
+    report: Report | None = None,
+) -> Path:
+    """Write to ``directory`` without reading it back; else as ``collect`` with ``save_to``."""
+    arguments = n_episodes, episode_length, seed, behaviour_policy, prior_policy, report
+    return write_chunks(_stream(source, str(directory), *arguments)[0], directory)
+
+
+def _stream(
+    source: Source,
+    destination: str,
+    n_episodes: int,
+    episode_length: int,
+    seed: int | Streams,
+    behaviour_policy: ArrayLike | None,
+    prior_policy: ArrayLike | None,
+    report: Report | None,
+) -> tuple[Iterator[Transitions], int]:
+    """The tuples, a block at a time, and their number; 0 where it shows only as they come.
+
+    ``destination`` is "memory", or the directory that they go to. Raises InputError where they do not fit there.
     """
     n_episodes = checks.at_least("n_episodes", n_episodes, 1)
     episode_length = checks.at_least("episode_length", episode_length, 1)
@@ -72,105 +143,54 @@ def collect(
     on_prior = behaviour_policy is None
     behaviour = prior if on_prior else check_policy("behaviour_policy", behaviour_policy, n_states, n_actions)
     rng = seed if isinstance(seed, Streams) else streams(seed)
-    report = report or (lambda _: None)
+    plan = Plan(n_episodes, episode_length, rng, behaviour, prior, on_prior)
     mdp = known_mdp(source)
-    if mdp is not None or isinstance(source, gym.vector.VectorEnv):  # exactly so many tuples
-        _fits("memory", n_episodes, episode_length, TUPLE_BYTES * n_episodes * episode_length)
+    n = 0
+    if mdp is not None or isinstance(source, gym.vector.VectorEnv):
+        n = n_episodes * episode_length
+        _fits(destination, plan, n * (TUPLE_BYTES if destination == "memory" else COLUMN_BYTES))
     if mdp is not None:
-        return _simulate(mdp, n_episodes, episode_length, rng, behaviour, prior, on_prior, report)
-    batch = None if isinstance(source, (TabularMDP, gym.vector.VectorEnv)) else batched(source)
-    if batch is not None:
-        return batch(
-            n_episodes, episode_length, seed=rng, behaviour_policy=None if on_prior else behaviour, prior_policy=prior
-        )
-    assert not isinstance(source, TabularMDP)
-    played = _played(source, n_episodes, episode_length, rng, behaviour, prior, on_prior, report)
-    return join(list(_holding(played, n_episodes, episode_length)))
+        chunks = _of_model(mdp, plan)
+    elif isinstance(source, gym.vector.VectorEnv):
+        chunks = vector_tuples(source, plan)
+    else:
+        assert not isinstance(source, TabularMDP)
+        batch = batched(source)
+        if batch is not None:
+            policies = {"behaviour_policy": None if on_prior else behaviour, "prior_policy": prior}
+            chunks = iter([batch(n_episodes, episode_length, seed=rng, **policies)])
+        else:
+            chunks = tuples(source, plan)
+            chunks = _holding(chunks, plan) if destination == "memory" else chunks
+    return chunks if report is None else _reported(chunks, report), n
 
 
-def _holding(chunks: Iterator[Transitions], n_episodes: int, episode_length: int) -> Iterator[Transitions]:
+def _reported(chunks: Iterator[Transitions], report: Report) -> Iterator[Transitions]:
+    done = 0
+    for chunk in chunks:
+        done += len(chunk)
+        report(done)
+        yield chunk
+
+
+def _holding(chunks: Iterator[Transitions], plan: Plan) -> Iterator[Transitions]:
     """``chunks`` of a stream whose length shows as it goes. Raises InputError before it is too long to be joined."""
     held, looked_at = 0, 20_000
     for chunk in chunks:
         held += len(chunk)
         if held >= looked_at:
-            _fits("memory", n_episodes, episode_length, COLUMN_BYTES * held)  # as much again
+            _fits("memory", plan, COLUMN_BYTES * held)  # as much again
             looked_at = held + held // 8
         yield chunk
 
 
-def _fits(where: str, n_episodes: int, episode_length: int, needed: int) -> None:
-    """Raise InputError unless ``needed`` bytes of a stream fit; ``where``: memory, or the directory it goes to."""
-    what = f"a stream of {n_episodes:,} episodes of {episode_length:,} steps"
-    if where == "memory":
-        checks.memory("n_episodes", n_episodes, needed, what)
+def _fits(destination: str, plan: Plan, needed: int) -> None:
+    """Raise InputError unless ``needed`` bytes of a stream fit ``destination``."""
+    what = f"a stream of {plan.n_episodes:,} episodes of {plan.episode_length:,} steps"
+    if destination == "memory":
+        checks.memory("n_episodes", plan.n_episodes, needed, what)
     else:
-        checks.disk("n_episodes", n_episodes, needed, what, where)
-
-
-def _played(
-    source: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any],
-    n_episodes: int,
-    episode_length: int,
-    rng: Streams,
-    behaviour: np.ndarray,
-    prior: np.ndarray,
-    on_prior: bool,
-    report: Report,
-) -> Iterator[Transitions]:
-    """The tuples of an environment that is stepped, some thousands at a time."""
-    if isinstance(source, gym.vector.VectorEnv):
-        return _step_vector(source, n_episodes * episode_length, rng, behaviour, prior, on_prior, report)
-    return _step_through(source, n_episodes, episode_length, rng, behaviour, prior, on_prior, report)
-
-
-def record(
-    source: TabularMDP | gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any],
-    directory: str | os.PathLike[str],
-    n_episodes: int,
-    episode_length: int,
-    seed: int | Streams = 0,
-    behaviour_policy: Any = None,
-    prior_policy: Any = None,
-    report: Report | None = None,
-) -> Path:
-    """Write what ``collect`` gives to a directory of columns (``erl_torch.open_recording`` reads it).
-
-    In memory of some tuples, whatever the length, but for this package's control tasks, whose episodes are played in
-    batches.
-
-    Raises:
-        InputError: as ``collect``; a directory that holds anything else.
-    """
-    n_states, n_actions = sizes(source)
-    mdp = known_mdp(source)
-    if mdp is None and not isinstance(source, (TabularMDP, gym.vector.VectorEnv)) and batched(source):
-        data = collect(source, n_episodes, episode_length, seed, behaviour_policy, prior_policy, report)
-        return save_columns(data, directory)
-    n_episodes = checks.at_least("n_episodes", n_episodes, 1)
-    episode_length = checks.at_least("episode_length", episode_length, 1)
-    prior = check_policy("prior_policy", prior_policy, n_states, n_actions)
-    on_prior = behaviour_policy is None
-    behaviour = prior if on_prior else check_policy("behaviour_policy", behaviour_policy, n_states, n_actions)
-    rng = seed if isinstance(seed, Streams) else streams(seed)
-    chunks: Iterator[Transitions]
-    if mdp is not None or isinstance(source, gym.vector.VectorEnv):
-        _fits(str(directory), n_episodes, episode_length, COLUMN_BYTES * n_episodes * episode_length)
-    if mdp is not None:
-        reward = mdp.reward
-        blocks = _blocks(mdp, n_episodes * episode_length, episode_length, rng, behaviour, prior, on_prior)
-        chunks = (of_pairs(*block, reward) for block in blocks)
-    else:
-        assert not isinstance(source, TabularMDP)
-        chunks = _played(source, n_episodes, episode_length, rng, behaviour, prior, on_prior, lambda _: None)
-    done = 0
-    with ColumnWriter(directory) as writer:
-        for chunk in chunks:
-            writer.append(chunk)
-            done += len(chunk)
-            if report is not None:
-                report(done)
-    return writer.directory
+        checks.disk("n_episodes", plan.n_episodes, needed, what, destination)
 
 
 def batched(env: gym.Env[Any, Any]) -> Callable[..., Transitions] | None:
@@ -189,159 +209,29 @@ def batched(env: gym.Env[Any, Any]) -> Callable[..., Transitions] | None:
     return collect_at_once
 
 
-def _simulate(
-    mdp: TabularMDP,
-    n_episodes: int,
-    episode_length: int,
-    rng: Streams,
-    behaviour: np.ndarray,
-    prior: np.ndarray,
-    on_prior: bool,
-    report: Report,
-) -> Transitions:
-    n = n_episodes * episode_length
-    pair, pair_next = np.empty(n, np.int32), np.empty(n, np.int32)
-    done = 0
-    for here, there in _blocks(mdp, n, episode_length, rng, behaviour, prior, on_prior):
-        pair[done : done + len(here)], pair_next[done : done + len(here)] = here, there
-        done += len(here)
-        report(done)
-    return of_pairs(pair, pair_next, mdp.reward)
-
-
-def _blocks(
-    mdp: TabularMDP,
-    n: int,
-    episode_length: int,
-    rng: Streams,
-    behaviour: np.ndarray,
-    prior: np.ndarray,
-    on_prior: bool,
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """``n`` tuples as (pair, pair_next), a block at a time."""
-    sampler = Sampler(mdp, [rng], episode_length, behaviour, prior, on_prior)
+def _of_model(mdp: TabularMDP, plan: Plan) -> Iterator[Transitions]:
+    """The tuples of ``plan``, sampled from ``mdp`` in compiled code, ``BLOCK`` at a time."""
+    n = plan.n_episodes * plan.episode_length
+    sampler = Sampler(mdp, [plan.rng], plan.episode_length, plan.behaviour, plan.prior, plan.on_prior)
     for begin in range(0, n, BLOCK):
         here, _, there = sampler.take(min(n, begin + BLOCK) - begin)
-        yield here[:, 0], there[:, 0]
+        yield _of_pairs(here[:, 0], there[:, 0], mdp.reward)
     sampler.give_back()
 
 
-def of_pairs(pair: np.ndarray, pair_next: np.ndarray, reward: np.ndarray) -> Transitions:
-    """The tuples of pairs s * A + a and s' * A + a', [N] each, with rewards from the table [S, A]."""
+def _of_pairs(pair: np.ndarray, pair_next: np.ndarray, reward: np.ndarray) -> Transitions:
+    """The tuples of pairs s * A + a and s' * A + a', [N] int32 each, with rewards from the table [S, A] of an MDP."""
     s, a = np.divmod(pair, np.int32(reward.shape[1]))
     s_next, a_next = np.divmod(pair_next, np.int32(reward.shape[1]))
-    return Transitions(s, a, reward.ravel()[pair], s_next, a_next)
+    return Transitions.checked(s, a, reward.ravel()[pair], s_next, a_next)
 
 
-def _step_through(
-    env: gym.Env[Any, Any],
-    n_episodes: int,
-    episode_length: int,
-    rng: Streams,
-    behaviour: np.ndarray,
-    prior: np.ndarray,
-    on_prior: bool,
-    report: Report,
-) -> Iterator[Transitions]:
-    rows: list[tuple[int, int, float, int, int]] = []
+def _filled(chunks: Iterator[Transitions], n: int) -> Transitions:
+    """``n`` tuples as one, in the memory of their columns and one chunk."""
+    columns = [np.empty(n, TYPES[name].newbyteorder("=")) for name in COLUMNS]
     done = 0
-    behaviour_cdf, prior_cdf = np.cumsum(behaviour, axis=1), np.cumsum(prior, axis=1)
-
-    def draw(cdf: np.ndarray, s: int) -> int:
-        x = rng.behaviour.random() * cdf[s, -1]
-        return int(np.searchsorted(cdf[s], x, side="right"))
-
-    state = reset(env, rng.environment)
-    for _ in range(n_episodes):
-        action = draw(behaviour_cdf, state)
-        for step in range(1, episode_length + 1):
-            observation, reward, terminated, truncated, _ = env.step(action)
-            over = terminated or truncated or step == episode_length
-            fresh = reset(env, rng.environment) if over else None
-            state_next = fresh if terminated and fresh is not None else int(observation)
-            action_next = draw(prior_cdf, state_next)
-            rows.append((state, action, float(reward), state_next, action_next))
-            if len(rows) == 10_000:
-                done += len(rows)
-                report(done)
-                yield _of_rows(rows)
-                rows = []
-            state = state_next if fresh is None else fresh
-            if over:
-                break
-            action = action_next if on_prior else draw(behaviour_cdf, state)
-    report(done + len(rows))
-    if rows:
-        yield _of_rows(rows)
-
-
-def _of_rows(rows: list[tuple[int, int, float, int, int]]) -> Transitions:
-    return Transitions(*(np.array(column) for column in zip(*rows, strict=True)))
-
-
-def _step_vector(
-    env: gym.vector.VectorEnv[Any, Any, Any],
-    n: int,
-    rng: Streams,
-    behaviour: np.ndarray,
-    prior: np.ndarray,
-    on_prior: bool,
-    report: Report,
-) -> Iterator[Transitions]:
-    """The first ``n`` tuples, step by step and within a step by environment."""
-    mode = env.metadata.get("autoreset_mode")
-    if not isinstance(mode, AutoresetMode):
-        raise InputError("metadata['autoreset_mode']", mode, "a gymnasium.vector.AutoresetMode")
-    behaviour_cdf, prior_cdf = np.cumsum(behaviour, axis=1), np.cumsum(prior, axis=1)
-
-    def draw(cdf: np.ndarray, s: np.ndarray) -> np.ndarray:
-        x = rng.behaviour.random(len(s)) * cdf[s, -1]
-        return np.asarray((cdf[s] <= x[:, None]).sum(1))
-
-    state = np.array(env.reset(seed=_seed(rng))[0])
-    action = draw(behaviour_cdf, state)
-    reward = np.zeros(env.num_envs)
-    restarting = np.zeros(env.num_envs, bool)  # this step is a reset: its observation a first state
-    unfinished = restarting.copy()  # terminated the step before: s' is that first state
-    columns: list[tuple[np.ndarray, ...]] = []
-    collected = given = 0
-    while collected < n:
-        observation, stepped_reward, terminated, truncated, info = env.step(action)
-        after = np.array(observation)
-        reward = np.where(restarting, reward, stepped_reward)
-        terminated, truncated = terminated & ~restarting, truncated & ~restarting
-        over = terminated | truncated
-        first = after.copy()  # first state of the next episode, where `known`
-        known = restarting.copy()
-        if over.any() and mode == AutoresetMode.SAME_STEP:
-            known |= over
-            after[over] = [int(last) for last in info["final_obs"][over]]
-        elif over.any() and mode == AutoresetMode.DISABLED:
-            known |= over
-            first = np.array(env.reset(seed=_seed(rng), options={"reset_mask": over})[0])
-        ready = (~restarting & (~terminated | known)) | unfinished
-        after = np.where((terminated & known) | unfinished, first, after)
-        action_next = draw(prior_cdf, after)
-        columns.append(tuple(column[ready] for column in (state, action, reward, after, action_next)))
-        collected += int(ready.sum())
-        report(min(collected, n))
-        if collected >= n or collected - given >= 10_000:
-            part = Transitions(*(np.concatenate(column) for column in zip(*columns, strict=True)))
-            yield part.first(min(collected, n) - given)
-            columns, given = [], collected
-        goes_on = ~over & ~restarting
-        unfinished = terminated & ~known
-        held_state, held_action = state, action
-        state = np.where(goes_on, after, first)
-        action = np.where(goes_on & on_prior, action_next, draw(behaviour_cdf, state))
-        restarting = over & ~known
-        state, action = np.where(restarting, held_state, state), np.where(restarting, held_action, action)
-
-
-def _seed(rng: Streams) -> int:
-    return int(rng.environment.integers(2**31))
-
-
-def reset(env: gym.Env[Any, Any], rng: np.random.Generator) -> int:
-    """Reset ``env`` with a seed drawn from ``rng``; the first state."""
-    return int(env.reset(seed=int(rng.integers(2**31)))[0])
+    for chunk in chunks:
+        for name, column in zip(COLUMNS, columns, strict=True):
+            column[done : done + len(chunk)] = getattr(chunk, name)
+        done += len(chunk)
+    return Transitions.checked(*columns)

@@ -12,6 +12,7 @@ import numpy as np
 
 from erl_torch.experience.transitions import Checksum, Transitions, regroup
 
+EXPERIENCE = "experience, as of Transitions or read_experience"  # what is allowed, in messages
 Part = TypeVar("Part")
 
 

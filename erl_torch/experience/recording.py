@@ -1,6 +1,6 @@
 """Experience of any size: streams of tuples in files, read in chunks of bounded memory.
 
-``open_recording`` picks the reader from the path
+``read_experience`` picks the reader from the path
 
     FILE.npz          columns s, a, r, s_next, a_next, as ``Transitions.save`` writes them
     DIRECTORY         s.npy, a.npy, r.npy, s_next.npy, a_next.npy, as ``ColumnWriter`` writes them: the fastest
@@ -29,7 +29,7 @@ import os
 import shutil
 import warnings
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol
 
@@ -39,7 +39,7 @@ from numpy.lib import format as npy
 from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.envs.discretise import Discretise
-from erl_torch.experience.experience import Experience
+from erl_torch.experience.experience import EXPERIENCE, Experience
 from erl_torch.experience.transitions import COLUMNS, Checksum, Transitions, join, regroup
 from erl_torch.files import check_directory
 from erl_torch.mdp.tabular import check_policy
@@ -206,7 +206,7 @@ class FileRecording:
         return np.asarray(bad)
 
 
-def open_recording(
+def read_experience(
     path: str | os.PathLike[str], n_states: int, n_actions: int, **options: Any
 ) -> Transitions | FileRecording:
     """The recording behind ``path``: in memory where it is no longer than a chunk, else in its files.
@@ -562,10 +562,26 @@ def _our_npz(path: Path) -> bool:
         return False
 
 
-def save_columns(data: Experience, directory: str | os.PathLike[str]) -> Path:
-    """Write a recording of any size to a directory of columns, which is the fastest to read."""
-    checks.instance("data", data, Experience, "a recording, as of Transitions or open_recording")
+def write_experience(data: Experience, directory: str | os.PathLike[str]) -> Path:
+    """Write experience of any size to a directory of columns, which is the fastest to read.
+
+    Args:
+        data: as of ``Transitions`` or ``read_experience``.
+        directory: a new one, or a directory of columns, which is replaced once the new one is whole.
+
+    Returns:
+        ``directory``.
+
+    Raises:
+        InputError: data that is no ``Experience``, or a directory that holds anything but columns.
+    """
+    checks.instance("data", data, Experience, EXPERIENCE)
+    return write_chunks(data.chunks(), directory)
+
+
+def write_chunks(chunks: Iterable[Transitions], directory: str | os.PathLike[str]) -> Path:
+    """As ``write_experience``, for tuples that come once."""
     with ColumnWriter(directory) as writer:
-        for chunk in data.chunks():
+        for chunk in chunks:
             writer.append(chunk)
     return writer.directory

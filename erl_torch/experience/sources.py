@@ -17,7 +17,7 @@ from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.experience.collect import collect, record
 from erl_torch.experience.experience import Experience
-from erl_torch.experience.recording import CHUNK, FileRecording, check_target, open_recording
+from erl_torch.experience.recording import CHUNK, FileRecording, check_target, read_experience
 from erl_torch.experience.simulation import Simulation
 from erl_torch.files import read_npy
 from erl_torch.mdp.from_gymnasium import known_mdp
@@ -89,7 +89,7 @@ class Simulate(Source):
         check_target("save_to", self.save_to)
         if self.save_to.endswith("/"):
             path = record(problem.source, self.save_to, *sizes, seed, behaviour, problem.prior, report)
-            return open_recording(path, problem.n_states, problem.n_actions)
+            return read_experience(path, problem.n_states, problem.n_actions)
         data = collect(problem.source, *sizes, seed, behaviour, problem.prior, report)
         check_target("save_to", self.save_to)  # again: the collecting may have taken hours
         data.save(self.save_to)

@@ -20,7 +20,7 @@ import torch
 from erl_torch import checks
 from erl_torch.empirical.counts import EmpiricalMDP, EmpiricalProblem, empirical_mdp
 from erl_torch.experience.experience import Experience
-from erl_torch.learners.learner import Streaming, columns, message
+from erl_torch.learners.learner import StreamLearner, columns, message
 from erl_torch.mdp.tabular import check_policy
 from erl_torch.solution import Solution, Status, proven
 from erl_torch.solvers.soft_bellman import solve_problem
@@ -69,7 +69,7 @@ class CertaintyEquivalenceStream:
 
 
 @dataclass(frozen=True, eq=False)
-class CertaintyEquivalence(Streaming[CertaintyEquivalenceState, CertaintyEquivalenceStream]):
+class CertaintyEquivalence(StreamLearner[CertaintyEquivalenceState, CertaintyEquivalenceStream]):
     """Counts -> empirical model -> soft policy iteration.
 
     Args:

@@ -1,4 +1,4 @@
-"""The contract of learners: ``Learner`` and ``State``; ``Streaming`` does what is the same for all that stream."""
+"""The contract of learners: ``Learner`` and ``State``; ``StreamLearner`` does what is the same for all that stream."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import numpy as np
 import torch
 
 from erl_torch import checks
-from erl_torch.experience.experience import Experience
+from erl_torch.experience.experience import EXPERIENCE, Experience
+from erl_torch.log.quantities import Quantity
 from erl_torch.problem import Policy, Problem
 from erl_torch.solution import Solution, Status
 
@@ -121,7 +122,9 @@ class Learner(Protocol[S, E, A]):
 
 
 class TabularLearner(Learner[S, Experience, Solution], Protocol[S]):
-    """One learner of tables. For those that stream tuples, ``Streaming`` has most of it."""
+    """One learner of tables. For those that stream tuples, ``StreamLearner`` has most of it."""
+
+    quantities: ClassVar[tuple[Quantity, ...]]  # what it logs beside those of erl_torch.log.quantities
 
     @property
     def beta(self) -> float:
@@ -143,13 +146,14 @@ class TabularLearner(Learner[S, Experience, Solution], Protocol[S]):
         """``start``, of these sizes."""
 
 
-class Streaming(ABC, Generic[T, Prepared]):
+class StreamLearner(ABC, Generic[T, Prepared]):
     """A learner that streams tuples in epochs: a subclass has ``init``, ``prepare``, ``step``, ``finished`` and
     ``solution``."""
 
     unit: ClassVar[str] = "tuples"
     needs_model: ClassVar[bool] = False
     states: ClassVar[tuple[type, ...]] = ()
+    quantities: ClassVar[tuple[Quantity, ...]] = ()
     stream_bytes: ClassVar[int] = 40  # memory of a tuple in ``prepare``d experience
 
     beta: float
@@ -215,7 +219,7 @@ class Streaming(ABC, Generic[T, Prepared]):
         The caller may log it, save it, or stop. Raises what ``prepare`` and ``step`` raise; the state yielded last is
         then still good.
         """
-        checks.instance("transitions", transitions, Experience, "a recording, as of Transitions or open_recording")
+        checks.instance("transitions", transitions, Experience, EXPERIENCE)
         stream = self.prepare(transitions, n_states, n_actions)
         state = self.init(n_states, n_actions) if state is None else state
         while not self.finished(state):

@@ -34,7 +34,7 @@ from erl_torch.checks import InputError
 from erl_torch.experience.simulation import ReplicaExperience, Simulation, fits, streams_of, tuples_of
 from erl_torch.experience.transitions import Transitions
 from erl_torch.files import read_npz, write_npz
-from erl_torch.learners.learner import NonFiniteError, Streaming, columns
+from erl_torch.learners.learner import NonFiniteError, StreamLearner, columns
 from erl_torch.learners.s1.algorithm import AlgorithmS1
 from erl_torch.learners.s1.lanes import LanesState, can_interleave, interleave
 from erl_torch.learners.together import Together, check_learner
@@ -65,7 +65,7 @@ class ReplicaState(Protocol):
     def replica(self, r: int) -> Any:
         """The state of one replica, as its own learner would have it."""
 
-    def milestone(self, learners: Sequence[Streaming[Any, Any]]) -> str:
+    def milestone(self, learners: Sequence[StreamLearner[Any, Any]]) -> str:
         """The milestone of the replicas that reached one in the last epoch; "" if none did."""
 
     def metrics(self) -> dict[str, np.ndarray]:
@@ -295,7 +295,7 @@ class EachState:
     def replica(self, r: int) -> Any:
         return self.states[r]
 
-    def milestone(self, learners: Sequence[Streaming[Any, Any]]) -> str:
+    def milestone(self, learners: Sequence[StreamLearner[Any, Any]]) -> str:
         ended = [r for r in self.stepped if r not in self.failures and learners[r].milestone(self.states[r])]
         furthest = max(ended, key=lambda r: self.states[r].n_tuples, default=None)
         return "" if furthest is None else learners[furthest].milestone(self.states[furthest])

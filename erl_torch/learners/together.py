@@ -10,7 +10,7 @@ import numpy as np
 
 from erl_torch import checks
 from erl_torch.checks import InputError
-from erl_torch.learners.learner import Streaming
+from erl_torch.learners.learner import StreamLearner
 from erl_torch.mdp.tabular import check_policy
 
 
@@ -18,7 +18,7 @@ from erl_torch.mdp.tabular import check_policy
 class Together:
     """Learners of one class and one prior policy, side by side; arguments as of ``Replicas``."""
 
-    learners: tuple[Streaming[Any, Any], ...]
+    learners: tuple[StreamLearner[Any, Any], ...]
     threads: int | None = None
     block: int | None = None
     layout: str = "auto"
@@ -52,5 +52,5 @@ class Together:
 
 
 def check_learner(key: str, learner: object) -> None:
-    if not isinstance(learner, Streaming) or not is_dataclass(learner):
+    if not isinstance(learner, StreamLearner) or not is_dataclass(learner):
         raise InputError(key, f"{learner} ({type(learner).__name__})", "a learner that streams, as AlgorithmS1()")

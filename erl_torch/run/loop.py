@@ -21,6 +21,7 @@ from erl_torch.learners.learner import Learner, NonFiniteError, State, columns
 from erl_torch.log.tensorboard import Board, Boards
 from erl_torch.problem import Problem
 from erl_torch.run.checkpoint import Checkpoints, Content, Ended, rows_of
+from erl_torch.run.origin import texts
 
 SafePoint = Callable[[], None]
 Row = Mapping[str, Any]  # of the history: ``metrics()`` of a state
@@ -100,7 +101,7 @@ class Run(Generic[S, E, A]):
         recorder: what is made of the states.
         saved: checkpoints, of the run directory.
         hyperparameters: by name, for tab HParams.
-        configuration: the settings as text, for tab Text.
+        configuration: the settings as YAML, for tab Text.
         every: epochs between records; milestones are always recorded.
         talks: progress bar, milestones and summary are shown.
         safe_point: called after every epoch; may raise SystemExit or KeyboardInterrupt.
@@ -120,8 +121,8 @@ class Run(Generic[S, E, A]):
     safe_point: SafePoint
     began: float
 
-    def perform(self, notes: list[str]) -> dict[str, Any]:
-        """Go through the run, or what is left of it; returns what ``result.json`` holds.
+    def perform(self, notes: list[str]) -> tuple[A, dict[str, Any]]:
+        """Go through the run, or what is left of it; returns the solution, and what ``result.json`` holds.
 
         Whatever ends it, what was learnt until then is written, and the error goes on to the caller.
         """
@@ -142,7 +143,7 @@ class Run(Generic[S, E, A]):
         board = Board(saved.directory, self.hyperparameters, recorder.boards, mark)
         with ended, saved.refusing(lambda: bool(outcome.history)), board:
             if not checkpoint:
-                board.texts(self.configuration)
+                board.texts(texts(self.configuration, saved.directory))
             recorder.open(board, checkpoint is not None)
             self._learn(outcome, checkpoint is not None, board, ended, began)
             solution = learner.solution(outcome.state, outcome.history, outcome.stopped)
@@ -163,7 +164,7 @@ class Run(Generic[S, E, A]):
         saved.clear()
         if (failure := recorder.failed(solution)) is not None:
             raise failure
-        return result
+        return solution, result
 
     def _learn(self, outcome: Outcome[S], goes_on: bool, board: Board, ended: Ended, began: float) -> None:
         """The loop. What ends it goes into ``outcome``; with nothing learnt, it is raised."""

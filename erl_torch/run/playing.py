@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from erl_torch import checks
 from erl_torch.checks import InputError
-from erl_torch.experience.collect import reset
+from erl_torch.experience.play import draw_action, episode, reset
 from erl_torch.files import write_gif
 from erl_torch.learners.replicas import ReplicaSolution
 from erl_torch.mdp.from_gymnasium import sizes
@@ -118,17 +119,12 @@ def episodes(
             if isinstance(shown[0], np.ndarray):
                 most = min(n_shown, horizon)
                 checks.memory("n_steps", n_shown, shown[0].nbytes * most, f"{most:,} pictures")
-        for _ in range(horizon):
-            a = int(np.searchsorted(cdf[s], rng.random() * cdf[s, -1], side="right"))
-            observation, reward, terminated, truncated, _ = env.step(a)
-            s = int(observation)
-            returns[i] += float(reward)
+        for step in episode(env, s, partial(draw_action, cdf, rng), horizon):
+            returns[i] += step.r
             lengths[i] += 1
-            ended[i] = terminated
+            ended[i] = step.terminated
             if i == 0 and lengths[0] <= n_shown:
                 shown.append(env.render())
-            if terminated or truncated:
-                break
     return Played(returns, lengths, ended, shown)
 
 

@@ -91,7 +91,8 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
         problem = make_problem(cfg, env, world, learner)
         make = _replicas if many else _single
         run = make(cfg, learner, problem, settings, saved, safe_point, began)
-        return run.perform(notes)
+        _, result = run.perform(notes)
+        return result
 
 
 def evaluation_settings(cfg: DictConfig) -> EvaluationSettings:
@@ -119,7 +120,7 @@ def _common(
     return {
         "problem": problem,
         "saved": saved,
-        "hyperparameters": hyperparameters(cfg, **more),
+        "hyperparameters": hyperparameters(plain(cfg), **more),
         "configuration": OmegaConf.to_yaml(cfg, resolve=True),
         "every": settings.every,
         "talks": True,

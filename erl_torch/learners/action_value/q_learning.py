@@ -42,7 +42,7 @@ from erl_torch.checks import InputError
 from erl_torch.experience.experience import Experience, Parts
 from erl_torch.experience.transitions import Transitions
 from erl_torch.learners.action_value import kernels
-from erl_torch.learners.learner import NonFiniteError, Streaming, columns, message
+from erl_torch.learners.learner import NonFiniteError, StreamLearner, columns, message
 from erl_torch.mdp.tabular import check_prior
 from erl_torch.solution import Solution
 
@@ -105,7 +105,7 @@ class ActionValueStream:
 
 
 @dataclass(frozen=True, eq=False)
-class ActionValueLearner(Streaming[ActionValueState, ActionValueStream]):
+class ActionValueLearner(StreamLearner[ActionValueState, ActionValueStream]):
     """What the learners of action values share; see the module's docstring.
 
     Args:

@@ -86,7 +86,7 @@ from erl_torch.empirical.counts import EmpiricalMDP, EmpiricalProblem, empirical
 from erl_torch.experience.experience import Experience, Parts, Selection
 from erl_torch.experience.transitions import Transitions
 from erl_torch.learners.efficient_s1 import kernels
-from erl_torch.learners.learner import NonFiniteError, Streaming, columns, message
+from erl_torch.learners.learner import NonFiniteError, StreamLearner, columns, message
 from erl_torch.learners.s1.algorithm import BLOCK, LOG_PSI_EPSILON
 from erl_torch.mdp.tabular import check_prior
 from erl_torch.solution import Solution, Status, proven
@@ -279,7 +279,7 @@ class EfficientStream:
 
 
 @dataclass(frozen=True, eq=False)
-class EfficientS1(Streaming[EfficientState, EfficientStream]):
+class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
     """Algorithm S1 with options that reach certainty equivalence; see the module's docstring.
 
     Args:

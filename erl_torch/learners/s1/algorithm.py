@@ -75,7 +75,7 @@ from erl_torch.checks import InputError
 from erl_torch.empirical.counts import tally
 from erl_torch.experience.experience import Experience, Parts, tuple_at
 from erl_torch.experience.transitions import Transitions
-from erl_torch.learners.learner import NonFiniteError, Streaming, columns, message
+from erl_torch.learners.learner import NonFiniteError, StreamLearner, columns, message
 from erl_torch.learners.s1 import kernels, listing
 from erl_torch.mdp.tabular import check_prior
 from erl_torch.solution import Solution, Status
@@ -173,7 +173,7 @@ class S1Stream:
 
 
 @dataclass(frozen=True, eq=False)
-class AlgorithmS1(Streaming[S1State, S1Stream]):
+class AlgorithmS1(StreamLearner[S1State, S1Stream]):
     """Algorithm S1, every line of the listing; see the module's docstring for symbols and open points.
 
     Args:

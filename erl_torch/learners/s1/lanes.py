@@ -21,7 +21,7 @@ from erl_torch.checks import InputError
 from erl_torch.experience.sampling import Sampler
 from erl_torch.experience.simulation import TUPLE_BYTES, ReplicaExperience, Simulation, fits, tuples_of
 from erl_torch.experience.transitions import Transitions
-from erl_torch.learners.learner import NonFiniteError, Streaming
+from erl_torch.learners.learner import NonFiniteError, StreamLearner
 from erl_torch.learners.s1 import device as s1_torch
 from erl_torch.learners.s1 import kernels
 from erl_torch.learners.s1.algorithm import AlgorithmS1, S1State, S1Stream, gains, line_12, positive, reward_biases
@@ -83,7 +83,7 @@ class LanesState:
         ended = [last.n_tuples for last, _ in self.ended.values()]
         return self.n_tuples * (len(self.beta) - len(ended)) + sum(ended)
 
-    def milestone(self, learners: Sequence[Streaming[Any, Any]]) -> str:
+    def milestone(self, learners: Sequence[StreamLearner[Any, Any]]) -> str:
         alive = next((r for r in range(len(self.beta)) if r not in self.ended), None)
         return "" if alive is None else learners[alive].milestone(self.replica(alive))
 

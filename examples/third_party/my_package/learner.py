@@ -29,7 +29,7 @@ class SweepsState:
 
 
 @dataclass(frozen=True)
-class Sweeps(erl_torch.Streaming):
+class Sweeps(erl_torch.StreamLearner):
     """Its settings are its fields: learner.beta, learner.rate, learner.n_epochs."""
 
     beta: float = 10.0

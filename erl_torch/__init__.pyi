@@ -1,0 +1,53 @@
+"""Types of the names that ``erl_torch`` loads on first use."""
+
+from erl_torch.checks import InputError as InputError
+from erl_torch.empirical.counts import EmpiricalMDP as EmpiricalMDP
+from erl_torch.empirical.counts import empirical_mdp as empirical_mdp
+from erl_torch.empirical.uncertainty import Estimate as Estimate
+from erl_torch.empirical.uncertainty import bootstrap_theta as bootstrap_theta
+from erl_torch.empirical.uncertainty import policy_uncertainty as policy_uncertainty
+from erl_torch.empirical.uncertainty import theta_uncertainty as theta_uncertainty
+from erl_torch.envs.estimate import EstimatedModel as EstimatedModel
+from erl_torch.envs.estimate import estimate_mdp as estimate_mdp
+from erl_torch.evaluation import Evaluation as Evaluation
+from erl_torch.evaluation import evaluate as evaluate
+from erl_torch.experience.collect import collect as collect
+from erl_torch.experience.experience import Experience as Experience
+from erl_torch.experience.recording import read_experience as read_experience
+from erl_torch.experience.recording import write_experience as write_experience
+from erl_torch.experience.rollouts import collect_rollouts as collect_rollouts
+from erl_torch.experience.rollouts import rollout as rollout
+from erl_torch.experience.simulation import Simulation as Simulation
+from erl_torch.experience.sources import Source as Source
+from erl_torch.experience.transitions import Transitions as Transitions
+from erl_torch.learners.certainty_equivalence import CertaintyEquivalence as CertaintyEquivalence
+from erl_torch.learners.efficient_s1.algorithm import EfficientS1 as EfficientS1
+from erl_torch.learners.learner import Learner as Learner
+from erl_torch.learners.learner import NonFiniteError as NonFiniteError
+from erl_torch.learners.learner import State as State
+from erl_torch.learners.learner import StreamLearner as StreamLearner
+from erl_torch.learners.replicas import Replicas as Replicas
+from erl_torch.learners.replicas import ReplicaSolution as ReplicaSolution
+from erl_torch.learners.s1.algorithm import AlgorithmS1 as AlgorithmS1
+from erl_torch.learners.s1.algorithm import ListedS1 as ListedS1
+from erl_torch.learners.s1.algorithm import S1State as S1State
+from erl_torch.mdp.from_gymnasium import MeanRewardWarning as MeanRewardWarning
+from erl_torch.mdp.from_gymnasium import tabular_mdp as tabular_mdp
+from erl_torch.mdp.tabular import TabularMDP as TabularMDP
+from erl_torch.notes import Note as Note
+from erl_torch.problem import Policy as Policy
+from erl_torch.problem import Problem as Problem
+from erl_torch.run.judge import EvaluationSettings as EvaluationSettings
+from erl_torch.run.session import train as train
+from erl_torch.solution import Solution as Solution
+from erl_torch.solution import Status as Status
+from erl_torch.solvers import certify as certify
+from erl_torch.solvers import iterate_biasing as iterate_biasing
+from erl_torch.solvers import perron as perron
+from erl_torch.solvers import solve_biasing as solve_biasing
+from erl_torch.solvers import solve_soft_bellman as solve_soft_bellman
+
+__version__: str
+__all__: list[str]
+
+def __getattr__(name: str) -> object: ...  # older names, with a DeprecationWarning

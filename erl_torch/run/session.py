@@ -1,0 +1,255 @@
+"""``train``: a logged run from Python, of objects that the caller has made."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import time
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any, overload
+
+import gymnasium as gym
+import numpy as np
+import torch
+import yaml
+
+from erl_torch import checks
+from erl_torch.checks import InputError
+from erl_torch.envs.tabular import TabularEnv
+from erl_torch.experience.experience import Experience
+from erl_torch.experience.simulation import ReplicaExperience, Simulation, streams_of
+from erl_torch.experience.sources import Source
+from erl_torch.experience.transitions import Transitions
+from erl_torch.learners.learner import TabularLearner
+from erl_torch.learners.replicas import Replicas, ReplicaSolution
+from erl_torch.log.tensorboard import hyperparameters
+from erl_torch.mdp.from_gymnasium import known_mdp, sizes
+from erl_torch.mdp.tabular import TabularMDP, check_policy
+from erl_torch.notes import Note, collected
+from erl_torch.problem import Problem
+from erl_torch.rng import streams
+from erl_torch.run.checkpoint import Checkpoints
+from erl_torch.run.groups import groups_among
+from erl_torch.run.judge import EvaluationSettings
+from erl_torch.run.loop import Run
+from erl_torch.run.replicas import ReplicaRecorder
+from erl_torch.run.report import Title
+from erl_torch.run.single import SingleRecorder
+from erl_torch.solution import Solution
+
+Given = Problem | TabularMDP | gym.Env[Any, Any]
+
+
+@overload
+def train(
+    learner: TabularLearner[Any],
+    problem: Given,
+    experience: Experience | Source | None = None,
+    *,
+    directory: str | os.PathLike[str],
+    seed: int = 0,
+    evaluation: EvaluationSettings | None = None,
+    checkpoint_every: float | None = 60.0,
+    talks: bool = False,
+) -> Solution: ...
+
+
+@overload
+def train(
+    learner: Replicas,
+    problem: Given,
+    experience: ReplicaExperience | Source | None = None,
+    *,
+    directory: str | os.PathLike[str],
+    seed: int = 0,
+    evaluation: EvaluationSettings | None = None,
+    checkpoint_every: float | None = 60.0,
+    talks: bool = False,
+) -> ReplicaSolution: ...
+
+
+def train(
+    learner: Any,
+    problem: Given,
+    experience: Any = None,
+    *,
+    directory: str | os.PathLike[str],
+    seed: int = 0,
+    evaluation: EvaluationSettings | None = None,
+    checkpoint_every: float | None = 60.0,
+    talks: bool = False,
+) -> Any:
+    """Learn in ``directory``: with TensorBoard's boards, checkpoints, ``result.json`` and the solution's file.
+
+    The run of the command line, without its configuration. Called again after a stop or a crash, it goes on from the
+    last checkpoint, bit for bit; a run that is complete is read. Nothing is printed and no global setting is changed,
+    unless ``talks``; notes are warnings of class ``Note``, once the run is written.
+
+    Args:
+        learner: one learner, an exact solver, or ``Replicas``.
+        problem: an environment of Gymnasium's with finite spaces, a model, or a ``Problem`` of both. Where the model is
+            known, policies are evaluated on it and the solution is certified.
+        experience: tuples to learn from, or a ``Source`` of them; of ``Replicas`` also one stream per replica, or a
+            ``Simulation``. None of an exact solver.
+        directory: of the run; made if it is missing.
+        seed: of the source, and of episodes that are played; replicas have ``seed``, ``seed + 1``, ...
+        evaluation: what is measured of the policy while it learns; None is ``EvaluationSettings()``.
+        checkpoint_every: seconds between checkpoints; 0 is after every epoch, None is none but on a stop.
+        talks: show progress bar, milestones and summary.
+
+    Raises:
+        InputError: an argument that cannot be used, or a directory that holds another run.
+        NonFiniteError: the learner (or a replica) left the finite numbers; everything is written, up to the last good
+            epoch.
+    """
+    began = time.perf_counter()
+    seed = checks.at_least("seed", seed, 0)
+    if checkpoint_every is not None and not (checks.is_number(checkpoint_every) and checkpoint_every >= 0):
+        raise InputError("checkpoint_every", checkpoint_every, "seconds >= 0, or None")
+    settings = evaluation or EvaluationSettings()
+    many = isinstance(learner, Replicas)
+    one = learner.learners[0] if many else learner
+    for method in ("start", "run", "solution"):
+        if not callable(getattr(one, method, None)):
+            raise InputError("learner", type(one).__name__, f"a learner, as AlgorithmS1(): it has no method {method}")
+    given = _problem(problem, one.prior_policy, settings.horizon)
+    if learner.needs_model != (experience is None):
+        allowed = "None: the learner solves the model" if learner.needs_model else "given: tuples, or a source of them"
+        raise InputError("experience", type(experience).__name__, allowed)
+    learner.start(given)  # raises where the learner cannot learn this problem
+    described = _described(learner, given, experience, seed, settings)
+    saved = Checkpoints(Path(directory), described, checkpoint_every, getattr(one, "device", "cpu"))
+    if saved.result() is not None:
+        saved.clear()
+        kind, name = (ReplicaSolution, "replicas.npz") if many else (Solution, "solution.npz")
+        return kind.load(saved.directory / name)
+    title = Title(given.name, described["learner"]["name"], seed)
+    with collected(print_them=talks) as notes:
+        recorder: Any
+        if many:
+            experience, seeds = _of_replicas(learner, given, experience, seed)
+            groups, vary = groups_among(learner.learners)
+            recorder = ReplicaRecorder(learner, given, experience, groups, seeds, vary, settings, title, lambda: None)
+            n_experience = recorder.n_experience
+        else:
+            if isinstance(experience, Source):
+                experience = experience(given, seed, lambda _: None)
+            recorder = SingleRecorder(learner, given, experience, settings, streams(seed).evaluation, title)
+            n_experience = 0 if experience is None else len(experience)
+        run: Run[Any, Any, Any] = Run(
+            learner=learner,
+            problem=given,
+            experience=experience,
+            digest=_digest(experience),
+            recorder=recorder,
+            saved=saved,
+            hyperparameters=hyperparameters(described, n_experience=n_experience),
+            configuration=yaml.safe_dump(described, sort_keys=False),
+            every=settings.every,
+            talks=talks,
+            safe_point=lambda: None,
+            began=began,
+        )
+        solution, _ = run.perform(notes)
+    if not talks:
+        for text in notes:
+            warnings.warn(text, Note, stacklevel=2)
+    return solution
+
+
+def _problem(given: Given, prior_policy: Any, horizon: int) -> Problem:
+    """As a ``Problem``, with the prior of the learner. Raises InputError."""
+    if isinstance(given, Problem):
+        prior = check_policy("learner.prior_policy", prior_policy, given.n_states, given.n_actions)
+        return replace(given, prior=prior)
+    if isinstance(given, TabularMDP):
+        prior = check_policy("learner.prior_policy", prior_policy, given.n_states, given.n_actions)
+        return Problem(TabularEnv(given), given, prior, given, horizon=horizon, name="mdp")
+    checks.instance("problem", given, gym.Env, "an environment of Gymnasium's, a TabularMDP or a Problem")
+    prior = check_policy("learner.prior_policy", prior_policy, *sizes(given))
+    limit = given.spec.max_episode_steps if given.spec is not None else None
+    name = given.spec.id if given.spec is not None else type(given.unwrapped).__name__
+    return Problem(given, given, prior, known_mdp(given), horizon=min(horizon, limit or horizon), name=name)
+
+
+def _of_replicas(
+    replicas: Replicas, problem: Problem, experience: ReplicaExperience | Source, seed: int
+) -> tuple[ReplicaExperience, list[int]]:
+    """The experience of all replicas, and their seeds."""
+    if isinstance(experience, Simulation):
+        return experience, [int(one) for one in experience.seeds]
+    seeds = [seed + r for r in range(len(replicas))]
+    if not isinstance(experience, Source):
+        return experience, seeds
+    if (simulation := experience.simulation(problem, seeds, None)) is not None:
+        return simulation, seeds
+    recorded = [experience(problem, one, lambda _: None) for one in seeds]
+    held = [data for data in recorded if isinstance(data, Transitions)]
+    if len(held) < len(recorded):
+        raise InputError("experience", type(experience).__name__, "a source of tuples in memory, for replicas")
+    return held, seeds
+
+
+def _digest(experience: Experience | ReplicaExperience | None) -> Any:
+    if experience is None or isinstance(experience, Simulation):
+        return None
+    if isinstance(experience, Sequence):
+        return [data.checksum() for data in streams_of(experience)]
+    return experience.checksum()
+
+
+# -- what the run computes with, as text ----------------------------------------------------------------
+
+
+def _described(
+    learner: Any, problem: Problem, experience: object, seed: int, settings: EvaluationSettings
+) -> dict[str, Any]:
+    """Settings by name: a directory of other settings is refused."""
+    if isinstance(learner, Replicas):
+        name = type(learner.learners[0]).__name__
+        own = {str(r): _plain(one) for r, one in enumerate(learner.learners)}
+        values = own["0"] if all(one == own["0"] for one in own.values()) else own
+        values = {"n_replicas": len(learner), **values}
+    else:
+        name, values = type(learner).__name__, _plain(learner)
+    source = {"name": type(experience).__name__}
+    if isinstance(experience, (Source, Simulation)):
+        source |= _plain(experience)
+    return {
+        "env": {"name": problem.name, "model": None if problem.mdp is None else _plain(problem.mdp)},
+        "learner": {"name": name, **values},
+        "experience": source,
+        "evaluation": asdict(settings),
+        "seed": seed,
+    }
+
+
+def _plain(value: Any) -> Any:
+    """Numbers, text and containers; of an array or a model its shape and the SHA-256 of its bytes."""
+    if isinstance(value, TabularMDP):
+        p = value.transition
+        parts = (p.indptr, p.indices, p.data, value.reward, value.start)
+        return f"{value.n_states} states, {value.n_actions} actions, {_sha256(parts)}"
+    if isinstance(value, torch.Tensor):
+        value = value.detach().cpu().numpy()
+    if isinstance(value, np.ndarray):
+        return f"array {list(value.shape)}, {_sha256((value,))}"
+    if isinstance(value, np.generic):
+        return value.item()
+    if is_dataclass(value) and not isinstance(value, type):
+        return {f.name: _plain(getattr(value, f.name)) for f in fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple, range)):
+        return [_plain(item) for item in value]
+    return value if value is None or isinstance(value, (bool, int, float, str)) else repr(value)
+
+
+def _sha256(arrays: Sequence[np.ndarray]) -> str:
+    whole = hashlib.sha256()
+    for array in arrays:
+        whole.update(np.ascontiguousarray(array).tobytes())
+    return whole.hexdigest()[:16]
