@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from omegaconf import OmegaConf
 
 from erl_torch.checks import InputError
 
@@ -81,24 +80,6 @@ def read_json(path: str | os.PathLike[str], key: str, remedy: str) -> dict[str, 
     if not isinstance(value, dict):
         raise InputError(key, path, f"a JSON object; {remedy}")
     return value
-
-
-def began_with(directory: Path, key: str = "overrides") -> list[str] | None:
-    """The arguments that the run in ``directory`` began with; None where there is no record of them.
-
-    Raises InputError (under ``key``) for a record that is damaged.
-    """
-    path = directory / ".hydra" / "overrides.yaml"
-    if not path.exists():
-        return None
-    try:
-        arguments: Any = OmegaConf.to_container(OmegaConf.load(path))
-    except Exception as error:  # of the parser, of OmegaConf, of the file system, of bytes that are no text
-        reason = " ".join(str(error).split())[:200]
-        raise InputError(key, path, f"a readable list of the arguments that the run began with ({reason})") from error
-    if not isinstance(arguments, list) or not all(isinstance(item, str) for item in arguments):
-        raise InputError(key, path, "the list of the arguments that the run began with, key=value each")
-    return arguments
 
 
 def write_png(path: str | os.PathLike[str], pixels: np.ndarray) -> Path:

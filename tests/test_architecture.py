@@ -25,7 +25,6 @@ FLOORS = (
 BESIDE = {
     ("files", "checks"),
     ("rng", "checks"),
-    ("log", "files"),
     ("log", "checks"),
     ("solution", "mdp"),
     ("problem", "mdp"),
@@ -96,7 +95,7 @@ def test_kernels_call_those_of_their_own_file():
             assert {(name, other) for other in imported(path)} <= ACROSS
 
 
-CONFIGURED = {"hydra": {"cli"}, "omegaconf": {"cli", "run", "reproduction", "log", "files"}}
+CONFIGURED = {"hydra": {"cli"}, "omegaconf": {"cli", "run", "reproduction"}}
 
 
 @pytest.mark.parametrize("library", CONFIGURED)

@@ -8,13 +8,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers import PATIENCE, composed, events, undocumented, wait_until
+from helpers import PATIENCE, ROOT, composed, events, undocumented, wait_until
 from omegaconf import OmegaConf
+from tensorboard.plugins.custom_scalar import layout_pb2
 from tensorboard.plugins.hparams import plugin_data_pb2
 
-from erl_torch import NonFiniteError, solve_soft_bellman
+from erl_torch import InputError, NonFiniteError, collect, solve_soft_bellman
 from erl_torch.envs.windy_cliff import WindyCliffEnv
 from erl_torch.log import tensorboard as board
+from erl_torch.log.quantities import BIAS, CONVERGENCE, QUANTITIES, RETURNS, Quantity, with_own
 from erl_torch.run.report import where
 from erl_torch.run.training import train
 from erl_torch.solvers import certify
@@ -90,22 +92,22 @@ def test_certificate_of_a_known_optimum():
 
 def test_charts_are_those_that_have_data():
     known = {"data/theta", "data/theta_lower", "data/theta_upper"}
-    charts = board.layout(["s1/theta", "eval/objective"], known)
-    assert [list(charts[title]) for title in (board.CONVERGENCE, board.BIAS, board.RETURNS)] == [
-        ["theta; theta* of the model, ends of the data's 95%", "s1/theta in its bands: proven, data's 95%"],
+    charts = board.layout(["learner/theta", "eval/objective"], known)
+    assert [list(charts[title]) for title in (CONVERGENCE, BIAS, RETURNS)] == [
+        ["theta; theta* of the model, ends of the data's 95%", "learner/theta in its bands: proven, data's 95%"],
         [],
         ["objective; optimal, prior"],
     ]
-    assert charts[board.CONVERGENCE]["s1/theta in its bands: proven, data's 95%"] == [
-        ("s1/theta",) * 3,
+    assert charts[CONVERGENCE]["learner/theta in its bands: proven, data's 95%"] == [
+        ("learner/theta",) * 3,
         ("data/theta", "data/theta_lower", "data/theta_upper"),
     ]
-    assert len(board.layout(["s1/theta"], [])[board.CONVERGENCE]) == 1  # no band is known
+    assert len(board.layout(["learner/theta"], [])[CONVERGENCE]) == 1  # no band is known
 
 
 def test_bands_have_their_lower_end_below():
     """Of a run and of replicas, as TensorBoard's own message has them."""
-    one = board.layout(["s1/theta"], ["optimal/theta", "optimal/theta_lower", "data/theta", "data/theta_lower"])
+    one = board.layout(["learner/theta"], ["optimal/theta", "optimal/theta_lower", "data/theta", "data/theta_lower"])
     many = board.replica_layout({"all": ["theta"]}, ["theta"])
     ends = {
         (series.value, series.lower, series.upper)
@@ -127,13 +129,74 @@ def test_jobs_of_a_sweep_are_shown_side_by_side():
     assert where(Path("runs/windy_cliff/1"))[1] == "runs"
 
 
+def test_charts_show_runs_of_before_too():
+    """Their tags begin with s1/ and exact/."""
+    patterns = [pattern for titles in board.charts().values() for chart in titles.values() for pattern in chart]
+    for tag in ("learner/theta", "s1/theta", "exact/theta", "s1/psi_error", "learner/q_max", "exact/kl_max"):
+        assert sum(bool(re.match(pattern, tag)) for pattern in patterns) == 1, tag
+
+
+def test_every_quantity_has_its_own_name_and_tags():
+    names = [quantity.name for quantity in QUANTITIES]
+    tags = [tag for quantity in QUANTITIES for tag in quantity.tags]
+    assert len(set(names)) == len(names)
+    assert len(set(tags)) == len(tags)
+    assert all(quantity.unit and quantity.meaning for quantity in QUANTITIES)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (lambda: Quantity("a b", "1", ""), "quantities='?a b"),
+        (lambda: Quantity("a", "1", "", prefixes=("mine",)), "quantities.a='?mine"),
+        (lambda: with_own((Quantity("theta", "1", ""),)), "quantities='?theta"),
+        (lambda: with_own((Quantity("epoch", "1", ""),)), "quantities='?epoch"),
+        (lambda: with_own((Quantity("a", "1", ""),) * 2), "quantities='?a"),
+    ],
+)
+def test_wrong_quantities_are_refused(wrong, message):
+    with pytest.raises(InputError, match=message):
+        wrong()
+
+
+def test_a_metric_of_your_own(tmp_path, monkeypatch):
+    """The example of docs/logging.md, trained alone and as replicas, counts pairs as the tuples themselves do."""
+    page = (ROOT / "docs" / "logging.md").read_text()
+    example = page.partition("## A metric of your own")[2].partition("```python\n")[2].partition("```")[0]
+    (tmp_path / "counting.py").write_text(example)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "counting", raising=False)
+    overrides = ("learner=rvi_soft_q", "learner.class=counting.CountingSoftQ")
+    overrides += ("experience.n_episodes=2", "experience.episode_length=20", "learner.n_epochs=2")
+    overrides += ("evaluation.pictures=false", "checkpoint_every=0")
+    tuples = [collect(WindyCliffEnv().mdp, 2, 20, seed) for seed in (0, 1)]
+    left = [60 - len({*zip(data.s.tolist(), data.a.tolist(), strict=True)}) for data in tuples]
+
+    train(composed(*overrides), tmp_path / "one")
+    one = events(tmp_path / "one")
+    assert [event.value for event in one.Scalars("learner/never_tried")] == [60, left[0], left[0]]
+    train(composed(*overrides, "n_replicas=2"), tmp_path / "two")
+    two = events(tmp_path / "two")
+    assert [event.value for event in two.Scalars("replicas/never_tried_min")] == [min(left)] * 2
+    assert [event.value for event in two.Scalars("replicas/never_tried_max")] == [max(left)] * 2
+    for reader, title in ((one, "never tried, pairs"), (two, "replicas: never_tried")):
+        (event,) = reader.Tensors("custom_scalars__config__")
+        boards = layout_pb2.Layout.FromString(event.tensor_proto.string_val[0])
+        assert title in {chart.title for category in boards.category for chart in category.chart}
+
+
+def settings(*overrides):
+    """A configuration as plain containers."""
+    return OmegaConf.to_container(composed(*overrides), resolve=True)
+
+
 def test_hyperparameters_are_numbers_and_text():
-    found = board.hyperparameters(composed("env=frozen_lake"), n_replicas=3, vary=[1, 2])
+    found = board.hyperparameters(settings("env=frozen_lake"), n_replicas=3, vary=[1, 2])
     assert found["learner"] == "s1"
     assert found["clip_rho"] == "true"
     assert found["n_replicas"] == 3
     assert found["vary"] == "[1, 2]"
-    assert board.hyperparameters(composed("env=windy_frozen_lake", "env.desc=[SFG]"))["env.desc"] == '["SFG"]'
+    assert board.hyperparameters(settings("env=windy_frozen_lake", "env.desc=[SFG]"))["env.desc"] == '["SFG"]'
     assert found["env.on_end"] == "restart"
     assert not {"lr_rho", "env.suggest", "env.id", "name"} & set(found)  # lr_rho: null
 
@@ -194,13 +257,13 @@ def test_api_has_tags_boards_and_columns(runs, tensorboard):
     ask = tensorboard(root, len(kinds))
     tags = {run: set(found) for run, found in ask("plugin/scalars/tags").items()}
     assert tags == {name: set(events(root / name).Tags()["scalars"]) for name in kinds}
-    last = ask("plugin/scalars/scalars?run=s1&tag=s1/theta")[-1]
+    last = ask("plugin/scalars/scalars?run=s1&tag=learner/theta")[-1]
     assert last[1:] == [kinds["s1"]["n_tuples"], pytest.approx(kinds["s1"]["theta"], rel=1e-6)]
 
     boards = {category["title"]: category["chart"] for category in ask("plugin/custom_scalars/layout")["category"]}
-    assert list(boards) == [board.CONVERGENCE, board.BIAS, board.RETURNS]
+    assert list(boards) == [CONVERGENCE, BIAS, RETURNS]
     titles = {chart["title"] for charts in boards.values() for chart in charts}
-    assert {title for charts in board.LINES.values() for title in charts} <= titles
+    assert {title for charts in board.charts().values() for title in charts} <= titles
     written = set().union(*tags.values())
     for chart in (chart for charts in boards.values() for chart in charts):
         for band in chart.get("margin", {}).get("series", []):
@@ -210,7 +273,7 @@ def test_api_has_tags_boards_and_columns(runs, tensorboard):
 
     found = ask("plugin/hparams/experiment", {"includeMetrics": True})
     columns = {column["name"] for column in found["hparamInfos"]}
-    union = set().union(*(board.hyperparameters(composed(*o)) for o in ((), ("learner=s1_efficient",))))
+    union = set().union(*(board.hyperparameters(settings(*o)) for o in ((), ("learner=s1_efficient",))))
     assert union | {"discount", "method", "n_replicas", "n_experience"} <= columns
     metrics = [metric["name"]["tag"] for metric in found["metricInfos"]]
     first = ["Final/gap", "Final/objective", "Final/return", "Final/reward_per_step", "Final/theta"]

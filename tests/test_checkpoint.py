@@ -233,24 +233,24 @@ def test_the_log_may_be_damaged_before_a_run_goes_on(tmp_path, cut, capsys, dama
     train(cfg, tmp_path / "whole")
     (log,) = directory.glob("events.*")
     body = log.read_bytes()
-    old = scalars(directory)["s1/theta"]
+    old = scalars(directory)["learner/theta"]
     if damage == "deleted":
         log.unlink()
     else:
         log.write_bytes({"cut": body[: len(body) // 2], "empty": b"", "grown": body + body[:1000]}[damage])
-    kept = scalars(directory).get("s1/theta", []) if damage != "deleted" else []
+    kept = scalars(directory).get("learner/theta", []) if damage != "deleted" else []
     train(cfg, directory)
     assert (directory / "solution.npz").read_bytes() == (tmp_path / "whole/solution.npz").read_bytes()
-    whole = scalars(tmp_path / "whole")["s1/theta"]
+    whole = scalars(tmp_path / "whole")["learner/theta"]
     said = capsys.readouterr().err.count("has lost what it held at the checkpoint")
     assert names(directory) == names(tmp_path / "whole")
     if damage == "grown":
         assert said == 0
-        assert scalars(directory)["s1/theta"] == whole
+        assert scalars(directory)["learner/theta"] == whole
     else:
         assert said == 1
         assert len(kept) < len(old)
-        assert scalars(directory)["s1/theta"] == kept + whole[len(old) :]
+        assert scalars(directory)["learner/theta"] == kept + whole[len(old) :]
 
 
 class Bug(Exception):

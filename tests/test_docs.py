@@ -2,6 +2,7 @@
 
 import inspect
 import re
+import runpy
 
 import pytest
 from helpers import ROOT
@@ -53,3 +54,9 @@ def test_every_example_is_listed():
     page = (DOCS / "examples.md").read_text()
     for path in (ROOT / "examples").iterdir():
         assert path.suffix not in (".py", ".ipynb") or f"| `{path.name}` |" in page
+
+
+def test_tables_of_what_is_logged_are_those_of_the_code():
+    """If not: python docs/tools/quantities.py"""
+    page = (DOCS / "logging.md").read_text()
+    assert runpy.run_path(str(DOCS / "tools" / "quantities.py"))["current"](page) == page

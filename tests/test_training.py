@@ -53,7 +53,7 @@ def test_scalars(finished):
     reader = events(directory)
     steps = [0, *range(20_000, 120_001, 20_000)]
     documented = {
-        f"s1/{name}"
+        f"learner/{name}"
         for name in ("rho", "theta", "delta_max", "delta_mean", "psi_error", "psi_epochs", "bias_iteration")
     } | {"eval/return", "eval/reward_per_step", "eval/objective"}
     figures = {"objective", "reward_per_step", "return"}
@@ -72,13 +72,13 @@ def test_scalars(finished):
         values[tag] = [e.value for e in reader.Scalars(tag)]
         assert np.isfinite(values[tag]).all()
     assert values["eval/reward_per_step"][0] == pytest.approx(-1.6263453, abs=1e-6)  # the prior policy
-    assert values["s1/theta"][0] == pytest.approx(1.0)
-    assert values["s1/rho"][0] == pytest.approx(np.exp(-10))
-    assert values["s1/bias_iteration"] == [0, 0, 0, 1, 1, 2, 2]
-    for tag, key in [("s1/theta", "theta"), ("eval/objective", "objective"), ("eval/return", "return")]:
+    assert values["learner/theta"][0] == pytest.approx(1.0)
+    assert values["learner/rho"][0] == pytest.approx(np.exp(-10))
+    assert values["learner/bias_iteration"] == [0, 0, 0, 1, 1, 2, 2]
+    for tag, key in [("learner/theta", "theta"), ("eval/objective", "objective"), ("eval/return", "return")]:
         assert values[tag][-1] == pytest.approx(result[key], rel=1e-6)
     history = Solution.load(directory / "solution.npz").history
-    np.testing.assert_allclose(values["s1/delta_max"][1:], history["delta_max"], rtol=1e-6)
+    np.testing.assert_allclose(values["learner/delta_max"][1:], history["delta_max"], rtol=1e-6)
 
 
 def test_interval_of_the_data(finished):
@@ -169,12 +169,12 @@ def test_exact_learner(tmp_path, method):
     assert result["n_experience"] == 0
     reader = events(tmp_path)
     low, theta, high = (
-        [e.value for e in reader.Scalars(f"exact/{n}")] for n in ("theta_lower", "theta", "theta_upper")
+        [e.value for e in reader.Scalars(f"learner/{n}")] for n in ("theta_lower", "theta", "theta_upper")
     )
     assert len(low) == len(theta) == len(high) == result["n_iterations"]
     assert all(a <= b + 1e-6 for a, b in zip(low, high, strict=True))
     assert theta[-1] == pytest.approx(1.0101363366, abs=1e-6)
-    assert reader.Scalars("exact/kl_max")[-1].value < 1e-6
+    assert reader.Scalars("learner/kl_max")[-1].value < 1e-6
     assert len(reader.Images("policy")) == result["n_iterations"] + 1
     assert undocumented(tmp_path) == set()
     history = Solution.load(tmp_path / "solution.npz").history
@@ -261,7 +261,7 @@ def test_termination_keeps_what_was_learnt(typed, typed_here, tmp_path, number):
     result = json.loads((directory / "result.json").read_text())
     assert result["status"] == "stopped"
     assert result["n_tuples"] > 0
-    logged = events(directory).Scalars("s1/theta")
+    logged = events(directory).Scalars("learner/theta")
     assert logged[-1].step == result["n_tuples"]
     assert logged[-1].value == pytest.approx(result["theta"], rel=1e-6)
 

@@ -27,8 +27,9 @@ from omegaconf.errors import OmegaConfBaseException, ValidationError
 from erl_torch.checks import InputError, out_of_memory
 from erl_torch.cli import named_classes, sweeps
 from erl_torch.cli.config import composed, register
-from erl_torch.files import alone, began_with, write_bytes
+from erl_torch.files import alone, write_bytes
 from erl_torch.output import lasting
+from erl_torch.run.origin import began_with
 from erl_torch.run.settings import allowed
 
 # Here, for jobs in processes of their own: loading the task imports this module, and names directories next.

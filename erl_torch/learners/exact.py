@@ -17,6 +17,7 @@ from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.experience.experience import Experience
 from erl_torch.learners.learner import columns
+from erl_torch.log.quantities import Quantity
 from erl_torch.mdp.tabular import TabularMDP, check_policy
 from erl_torch.problem import Problem
 from erl_torch.solution import Solution, Status, proven
@@ -73,6 +74,7 @@ class Exact:
     unit: ClassVar[str] = "iterations"
     needs_model: ClassVar[bool] = True
     states: ClassVar[tuple[type, ...]] = ()
+    quantities: ClassVar[tuple[Quantity, ...]] = ()
     averages_exp_reward: ClassVar[bool] = False
     drawn_from_prior: ClassVar[str] = ""
 

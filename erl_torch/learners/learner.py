@@ -11,6 +11,7 @@ import torch
 
 from erl_torch import checks
 from erl_torch.experience.experience import Experience
+from erl_torch.log.quantities import Quantity
 from erl_torch.problem import Policy, Problem
 from erl_torch.solution import Solution, Status
 
@@ -123,6 +124,8 @@ class Learner(Protocol[S, E, A]):
 class TabularLearner(Learner[S, Experience, Solution], Protocol[S]):
     """One learner of tables. For those that stream tuples, ``Streaming`` has most of it."""
 
+    quantities: ClassVar[tuple[Quantity, ...]]  # what it logs beside those of erl_torch.log.quantities
+
     @property
     def beta(self) -> float:
         """Inverse temperature, 1/reward."""
@@ -150,6 +153,7 @@ class Streaming(ABC, Generic[T, Prepared]):
     unit: ClassVar[str] = "tuples"
     needs_model: ClassVar[bool] = False
     states: ClassVar[tuple[type, ...]] = ()
+    quantities: ClassVar[tuple[Quantity, ...]] = ()
     stream_bytes: ClassVar[int] = 40  # memory of a tuple in ``prepare``d experience
 
     beta: float

@@ -12,9 +12,9 @@ import struct
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 from tensorboard.compat.proto.event_pb2 import Event
+from tensorboard.compat.proto.summary_pb2 import Summary
 from tensorboard.summary.writer.record_writer import RecordWriter
 
 PATTERN = "events.out.tfevents.*"
@@ -56,8 +56,8 @@ class EventFile:
         if self.fresh:
             self._write(Event(wall_time=time.time(), file_version="brain.Event:2"))
 
-    def add(self, summary: Any, step: int = 0) -> None:
-        """One record of a summary, as ``torch.utils.tensorboard.summary`` makes them."""
+    def add(self, summary: Summary, step: int = 0) -> None:
+        """Write one record of a summary, as ``torch.utils.tensorboard.summary`` makes them."""
         self._write(Event(wall_time=time.time(), step=step, summary=summary))
 
     def mark(self) -> Mark:

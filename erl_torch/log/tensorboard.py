@@ -1,132 +1,115 @@
-"""TensorBoard: one event file a run. Tags, units and formulas: docs/logging.md."""
+"""TensorBoard: one event file per run, and its boards. Quantities: ``erl_torch.log.quantities``."""
 
 from __future__ import annotations
 
 import json
 import os
 import re
-import shlex
-import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 import numpy as np
-from omegaconf import DictConfig, OmegaConf
 from tensorboard.plugins.custom_scalar import layout_pb2
 from tensorboard.plugins.hparams import api_pb2, plugin_data_pb2
 from torch.utils.tensorboard import summary
 
-from erl_torch.checks import InputError
-from erl_torch.files import began_with
 from erl_torch.log.event_file import EventFile, Mark
+from erl_torch.log.quantities import QUANTITIES, Quantity
 
 Band = tuple[str, str, str]  # tags of value, lower and upper end
 Chart = Sequence[str | Band]  # lines (patterns of tags), or bands
-Boards = dict[str, dict[str, Chart]]  # charts by title, by board
+Boards = Mapping[str, dict[str, Chart]]  # charts by title, by board
 
 
 def _band(value: str) -> Band:
     return value, f"{value}_lower", f"{value}_upper"
 
 
-CONVERGENCE, BIAS, RETURNS = "Did theta converge?", "Reward bias", "Returns"
-# The same lines in every run: TensorBoard shows the union of all runs' layouts.
-LINES = {
-    CONVERGENCE: {
-        "theta; theta* of the model, ends of the data's 95%": [
-            "(s1|learner|exact)/theta$",
-            "optimal/theta$",
-            "data/theta_(lower|upper)$",
-        ],
-        "rho; of the optimum": ["(s1|learner)/rho$", "optimal/rho$"],
-        "error of psi, relative": ["s1/psi_error$"],
-        "biasing iteration": ["(s1|learner)/bias_iteration$"],
-        "loss in the empirical model, at most": ["learner/empirical_width$"],
-        "KL to the dynamics, nats": ["exact/kl_max$"],
-        "action values, extremes": ["learner/q_(min|max)$"],
-    },
-    BIAS: {
-        "delta, largest; of the optimum": ["(s1|learner|exact)/delta_max$", "optimal/delta_max$"],
-        "delta, mean; of the optimum": ["(s1|learner|exact)/delta_mean$", "optimal/delta_mean$"],
-    },
-    RETURNS: {
-        "objective; optimal, prior": ["(eval|optimal|prior)/objective$"],
-        "reward a step; optimal, prior": ["(eval|optimal|prior)/reward_per_step$"],
-        "return of an episode; optimal, prior": ["(eval|optimal|prior)/return$"],
-    },
-}
+def charts(table: Sequence[Quantity] = QUANTITIES) -> Boards:
+    """Lines by chart and board, the same in every run: TensorBoard shows the union of all runs' layouts."""
+    boards: dict[str, dict[str, list[str | Band]]] = {}
+    for quantity in table:
+        if quantity.board:
+            title = quantity.chart or quantity.axis
+            boards.setdefault(quantity.board, {}).setdefault(title, []).extend(quantity.lines)
+    return {board: dict(titles) for board, titles in boards.items()}
 
 
-def layout(learnt: Iterable[str], constant: Iterable[str]) -> Boards:
-    """The boards of a run that writes the tags ``learnt``, and ``constant`` ones as lines and bands beside them."""
-    written, known = list(learnt), set(constant)
+def layout(learnt: Iterable[str], constant: Iterable[str], table: Sequence[Quantity] = QUANTITIES) -> Boards:
+    """The boards of a run of one learner.
+
+    Args:
+        learnt: tags that are written at each record.
+        constant: tags of the constants beside them, which become lines and bands.
+        table: all quantities, as ``with_own`` gives them.
+    """
+    written, constants = set(learnt), set(constant)
+
+    def has_data(chart: Chart) -> bool:
+        return any(re.match(entry, tag) for entry in chart if isinstance(entry, str) for tag in written)
+
     boards: Boards = {
-        board: {
-            title: list(patterns)
-            for title, patterns in charts.items()
-            if any(re.match(patterns[0], tag) for tag in written)
-        }
-        for board, charts in LINES.items()
+        board: {title: chart for title, chart in titles.items() if has_data(chart)}
+        for board, titles in charts(table).items()
     }
-    # A chart of bands complains of each tag that is missing, and takes no patterns.
-    bands = [_band(name) for name in ("optimal/theta", "data/theta") if f"{name}_lower" in known]
-    for tag in ("s1/theta", "learner/theta"):
-        if tag in written and bands:
-            boards[CONVERGENCE][f"{tag} in its bands: proven, data's 95%"] = [(tag, tag, tag), *bands]
-    if "exact/theta" in written:
-        boards[CONVERGENCE]["exact/theta in its proven bounds"] = [_band("exact/theta")]
+    for quantity in table:
+        tag = f"learner/{quantity.name}"
+        # A chart of bands complains of each tag that is missing, and takes no patterns.
+        bands = [_band(f"{k}/{quantity.name}") for k in quantity.ends if f"{k}/{quantity.name}_lower" in constants]
+        if not quantity.board or tag not in written:
+            continue
+        if f"{tag}_lower" in written:
+            boards[quantity.board][f"{tag} in its proven bounds"] = [_band(tag)]
+        elif bands:
+            boards[quantity.board][f"{tag} in its bands: proven, data's 95%"] = [(tag, tag, tag), *bands]
     return boards
 
 
-def replica_layout(groups: Mapping[str, Iterable[str]], names: Iterable[str]) -> Boards:
+def replica_layout(
+    groups: Mapping[str, Iterable[str]], names: Iterable[str], table: Sequence[Quantity] = QUANTITIES
+) -> Boards:
     """The boards of a run of replicas.
 
     Args:
-        groups: by the name of each, the quantities whose optimum is known.
-        names: the quantities that are logged; those of board Returns have a prior.
+        groups: the names of the quantities whose optimum is known, by the name of each group.
+        names: the quantities that are logged.
+        table: all quantities, as ``with_own`` gives them.
     """
     written = set(names)
-
-    def bands(group: str, name: str, board: str) -> Chart:
-        # The band of each value alone: a chart has one for a tag.
-        found = [
-            tuple(f"{group}/{name}_{k}" for k in ends) for ends in (("mean", "q25", "q75"), ("median", "min", "max"))
-        ]
-        lines = ["optimal"] * (name in groups[group]) + ["prior"] * (board == RETURNS)
-        return [(a, b, c) for a, b, c in found] + [(f"{group}/{name}_{line}",) * 3 for line in lines]
-
-    return {
-        board: {f"{group}: {name}": bands(group, name, board) for group in groups for name in mine if name in written}
-        for board, mine in {
-            CONVERGENCE: ("theta", "rho", "empirical_width"),
-            BIAS: ("delta_max",),
-            RETURNS: ("objective", "reward_per_step", "return"),
-        }.items()
-    }
+    boards: dict[str, dict[str, Chart]] = {quantity.board: {} for quantity in table if quantity.board}
+    shown = [quantity for quantity in table if quantity.board and quantity.replicas and quantity.name in written]
+    for group, optima in groups.items():
+        for quantity in shown:
+            tag = f"{group}/{quantity.name}"
+            lines = ["optimal"] * (quantity.name in optima) + ["prior"] * ("prior" in quantity.prefixes)
+            # The band of each value alone: a chart has one band per tag.
+            boards[quantity.board][f"{group}: {quantity.name}"] = [
+                (f"{tag}_mean", f"{tag}_q25", f"{tag}_q75"),
+                (f"{tag}_median", f"{tag}_min", f"{tag}_max"),
+                *((f"{tag}_{line}",) * 3 for line in lines),
+            ]
+    return boards
 
 
-def hyperparameters(cfg: DictConfig, **more: Any) -> dict[str, int | float | str]:
-    """Settings of a run by name, as tab HParams takes them: numbers and text (a truth value would show as 1.0)."""
-    settings: Any = OmegaConf.to_container(cfg, resolve=True)
+def hyperparameters(settings: Mapping[str, Any], **more: object) -> dict[str, int | float | str]:
+    """The settings of a run by name, as tab HParams takes them: numbers and text.
+
+    Truth values and lists become JSON, since a truth value would show as 1.0. What is None or {} is left out.
+
+    Args:
+        settings: the configuration as plain containers, with ``env``, ``learner`` and ``seed``.
+        more: settings that are no part of it.
+    """
     env = {f"env.{k}": v for k, v in settings["env"].items() if k not in ("name", "id", "suggest")}
     learner = {k: v for k, v in settings["learner"].items() if k != "name"}
-    found = {"env": cfg.env.name, "learner": cfg.learner.name, **learner, **env, "seed": cfg.seed, **more}
+    names = {"env": settings["env"]["name"], "learner": settings["learner"]["name"]}
     return {
         key: value if isinstance(value, (int, float, str)) and not isinstance(value, bool) else json.dumps(value)
-        for key, value in found.items()
+        for key, value in {**names, **learner, **env, "seed": settings["seed"], **more}.items()
         if value is not None and value != {}
     }
-
-
-def command(directory: Path) -> str | None:
-    """What was typed to make the run in ``directory``; None where that was not the command line.
-
-    Raises InputError for a damaged note of it.
-    """
-    typed = began_with(directory)
-    return None if typed is None else shlex.join(["python", "train.py", *typed])
 
 
 class Board:
@@ -175,16 +158,8 @@ class Board:
         """An image [H, W, 3] uint8."""
         self._file.add(summary.image(tag, pixels, dataformats="HWC"), step)  # type: ignore[no-untyped-call]
 
-    def texts(self, configuration: str) -> None:
-        """The resolved configuration (YAML) and the command behind the run."""
-        texts = {"configuration": f"```yaml\n{configuration}```"}
-        try:
-            typed = command(self.directory)
-        except InputError as error:
-            typed = None
-            print(f"warning: the log does without the command behind the run ({error})", file=sys.stderr)
-        if typed is not None:
-            texts["command"] = f"```\n{typed}\n```"
+    def texts(self, texts: Mapping[str, str]) -> None:
+        """Markdown by tag, for tab Text."""
         for tag, markdown in texts.items():
             self._file.add(summary.text(tag, markdown))  # type: ignore[no-untyped-call]
 
@@ -215,10 +190,10 @@ class Board:
         plugin.content = content.SerializeToString()
 
 
-def _layout(boards: Boards) -> Any:
-    """As the protocol buffer; torch's ``add_custom_scalars`` takes one band a chart."""
+def _layout(boards: Boards) -> layout_pb2.Layout:
+    """``boards`` as the protocol buffer; torch's ``add_custom_scalars`` takes only one band per chart."""
 
-    def chart(title: str, entries: Chart) -> Any:
+    def chart(title: str, entries: Chart) -> layout_pb2.Chart:
         lines = [entry for entry in entries if isinstance(entry, str)]
         if lines:
             return layout_pb2.Chart(title=title, multiline=layout_pb2.MultilineChartContent(tag=lines))
@@ -229,8 +204,8 @@ def _layout(boards: Boards) -> Any:
 
     return layout_pb2.Layout(
         category=[
-            layout_pb2.Category(title=board, chart=[chart(title, entries) for title, entries in charts.items()])
-            for board, charts in boards.items()
-            if charts
+            layout_pb2.Category(title=board, chart=[chart(title, entries) for title, entries in titles.items()])
+            for board, titles in boards.items()
+            if titles
         ]
     )

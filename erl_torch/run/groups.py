@@ -11,17 +11,9 @@ import numpy as np
 
 from erl_torch import checks, pictures
 from erl_torch.checks import InputError
+from erl_torch.log.quantities import BANDS, PROGRESS, QUANTITIES, SWEEP, Quantity, tagged
 from erl_torch.log.tensorboard import Board
 
-QUANTITIES = {
-    "theta": "theta, reward a step",
-    "rho": "rho",
-    "delta_max": "largest reward bias, reward",
-    "empirical_width": "bound on the loss in the empirical model, reward a step",
-    "reward_per_step": "reward a step",
-    "objective": "objective J, reward a step",
-    "return": "return of an episode, reward",
-}  # what is logged of replicas, as far as there is
 LOGGED = ("mean", "median", "q25", "q75", "min", "max")
 MOST_LOGGED = 24  # groups with curves of their own; all are in result.json and in the pictures
 
@@ -90,8 +82,14 @@ def statistics(values: np.ndarray) -> dict[str, float]:
 class Record:
     """Figures of all replicas, record by record."""
 
-    def __init__(self, groups: Sequence[Group], optima: Sequence[Mapping[str, float]]) -> None:
+    def __init__(
+        self,
+        groups: Sequence[Group],
+        optima: Sequence[Mapping[str, float]],
+        table: Sequence[Quantity] = QUANTITIES,
+    ) -> None:
         self.groups, self.optima = groups, optima
+        self.names = [quantity.name for quantity in table if quantity.replicas]
         self.prior: dict[str, float] = {}  # by tag
         self.steps: dict[str, list[int]] = {}
         self.rows: dict[str, list[np.ndarray]] = {}
@@ -120,7 +118,7 @@ class Record:
         self.rows, self.alive = ({name: list(column) for name, column in x.items()} for x in content[2:])
 
     def add(self, step: int, measured: Mapping[str, np.ndarray], board: Board, alive: np.ndarray | None = None) -> None:
-        for name in QUANTITIES:
+        for name in self.names:
             if name not in measured:
                 continue
             values = np.asarray(measured[name], dtype=np.float64)
@@ -151,7 +149,7 @@ class Record:
     def curves(self) -> dict[str, list[pictures.BandLine]]:
         """For ``pictures.bands``: quantity -> one line per group."""
         shown: dict[str, list[pictures.BandLine]] = {}
-        for name in ("theta", "delta_max", "reward_per_step", "objective", "return"):
+        for name in BANDS:
             if name not in self.rows or (name == "return" and "reward_per_step" in self.rows):
                 continue
             lines = []
@@ -169,7 +167,7 @@ class Record:
     def line(self) -> str:
         """The last record in a line, over all replicas of the first group."""
         shown = []
-        for name in ("theta", "delta_max", "reward_per_step", "objective"):
+        for name in PROGRESS:
             found = self.statistics(self.groups[0]).get(name)
             if found:
                 shown.append(f"{name} {found['mean']:.5g} [{found['q25']:.5g}, {found['q75']:.5g}]")
@@ -188,17 +186,17 @@ class Record:
         if not judged:
             return {}
         best = max(judged, key=lambda g: rows[g]["objective"]["mean"])
-        names = ("theta", "objective", "reward_per_step", "return")
+        names = [quantity.name for quantity in QUANTITIES if "Final" in quantity.prefixes]
         final = {name: rows[best][name]["mean"] for name in names if rows[best].get(name)}
         if "objective" in self.optima[best]:
             final["gap"] = self.optima[best]["objective"] - final["objective"]
-        return {f"Final/{name}": value for name, value in final.items()}
+        return tagged("Final", final)
 
     def sweep(self) -> tuple[str, dict[str, list[pictures.BandLine]]]:
         """The first setting that varies, and quantity -> one line per combination of the others."""
         key = next(iter(self.groups[0].settings))
         panels: dict[str, list[pictures.BandLine]] = {}
-        for name in ("theta", "objective", "delta_max"):
+        for name in SWEEP:
             points: dict[str, list[tuple[float, dict[str, float], float | None]]] = {}
             pairs = zip(self.groups, self.optima, strict=True)
             for group, optimum in sorted(pairs, key=lambda pair: pair[0].settings[key]):

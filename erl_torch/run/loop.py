@@ -21,6 +21,7 @@ from erl_torch.learners.learner import Learner, NonFiniteError, State, columns
 from erl_torch.log.tensorboard import Board, Boards
 from erl_torch.problem import Problem
 from erl_torch.run.checkpoint import Checkpoints, Content, Ended, rows_of
+from erl_torch.run.origin import texts
 
 SafePoint = Callable[[], None]
 Row = Mapping[str, Any]  # of the history: ``metrics()`` of a state
@@ -142,7 +143,7 @@ class Run(Generic[S, E, A]):
         board = Board(saved.directory, self.hyperparameters, recorder.boards, mark)
         with ended, saved.refusing(lambda: bool(outcome.history)), board:
             if not checkpoint:
-                board.texts(self.configuration)
+                board.texts(texts(self.configuration, saved.directory))
             recorder.open(board, checkpoint is not None)
             self._learn(outcome, checkpoint is not None, board, ended, began)
             solution = learner.solution(outcome.state, outcome.history, outcome.stopped)

@@ -22,13 +22,14 @@ from erl_torch.experience.transitions import Transitions
 from erl_torch.files import write_png
 from erl_torch.learners.learner import NonFiniteError, Streaming
 from erl_torch.learners.replicas import Replicas, ReplicaSolution, ReplicaState
+from erl_torch.log.quantities import BY_NAME, with_own
 from erl_torch.log.tensorboard import Board, Boards, replica_layout
 from erl_torch.mdp.tabular import TabularMDP, check_policy
 from erl_torch.notes import note
 from erl_torch.problem import Problem
 from erl_torch.rng import streams
 from erl_torch.run.checkpoint import Content
-from erl_torch.run.groups import MOST_LOGGED, QUANTITIES, Group, Record, statistics
+from erl_torch.run.groups import MOST_LOGGED, Group, Record, statistics
 from erl_torch.run.judge import SMALL, EvaluationSettings, episode_model, judging_model, of_data
 from erl_torch.run.loop import Outcome, Row, SafePoint
 from erl_torch.run.report import Title, ended_as, last_rows, plural, versions
@@ -73,7 +74,8 @@ class ReplicaRecorder:
             note(text)
         by_beta = {beta: self._optimum(beta) for beta in {group.beta for group in self.groups}}
         self.optima = [by_beta[group.beta] for group in self.groups]
-        self.recorded = Record(self.groups, self.optima)
+        self.table = with_own(learners[0].quantities)
+        self.recorded = Record(self.groups, self.optima, self.table)
         self.first: dict[str, np.ndarray] = {}
 
     def _optimum(self, beta: float) -> dict[str, float]:
@@ -103,7 +105,7 @@ class ReplicaRecorder:
     def boards(self) -> Boards:
         metrics = self.replicas.learners[0].start(self.problem).metrics()
         optima = dict(zip((group.name for group in self.groups[:MOST_LOGGED]), self.optima, strict=False))
-        return replica_layout(optima, [*metrics, *self.first])
+        return replica_layout(optima, [*metrics, *self.first], self.table)
 
     def open(self, board: Board, goes_on: bool) -> None:
         if not goes_on:
@@ -145,10 +147,10 @@ class ReplicaRecorder:
             drawn.append(("sweep", panels, key, f"{title}, at the end"))
         for name, panels, x_label, heading in drawn:
             markers = name == "sweep"
-            whole = pictures.bands({QUANTITIES[k]: v for k, v in panels.items()}, x_label, heading, markers)
+            whole = pictures.bands({BY_NAME[k].axis: v for k, v in panels.items()}, x_label, heading, markers)
             write_png(board.directory / f"{name}.png", whole)
             for k, lines in panels.items():  # on TensorBoard's small cards one panel can be read
-                card = pictures.bands({QUANTITIES[k]: lines}, x_label, heading, markers, card=True)
+                card = pictures.bands({BY_NAME[k].axis: lines}, x_label, heading, markers, card=True)
                 board.picture(f"{name}/{k}", card, step)
         rate = outcome.state.work / max(outcome.seconds, 1e-9)
         board.scalars({"time/tuples_per_second": rate}, step)
@@ -228,8 +230,10 @@ class ReplicaRecorder:
         name = f"{self.title.env}, {self.title.learner}"
         last_seed = self.title.seed + self._n_each - 1
         seeds = f"seed {self.title.seed}" if self._n_each == 1 else f"seeds {self.title.seed} to {last_seed}"
-        table = _one_group if len(self.groups) == 1 else _many_groups
-        lines = ["", *table(name, seeds, self.groups, result)]
+        if len(self.groups) == 1:
+            lines = ["", *_one_group(name, seeds, self.recorded.names, result)]
+        else:
+            lines = ["", *_many_groups(name, seeds, self.groups, result)]
         if (away := result["data_half_widths"]) is not None:
             lines.append(
                 f"{'the data say':18}theta is off by {away['median']:.3g} half widths of the 95% interval of its own "
@@ -391,11 +395,11 @@ def reservations_of(
 # -- tables of the summary ----------------------------------------------------------------------------
 
 
-def _one_group(first: str, seeds: str, groups: Sequence[Group], result: Mapping[str, Any]) -> Iterator[str]:
+def _one_group(first: str, seeds: str, names: Sequence[str], result: Mapping[str, Any]) -> Iterator[str]:
     (group,) = result["groups"]
     yield f"{first}, beta {group['beta']:g}, {plural(result['n_replicas'], 'replica')} ({seeds}): {ended_as(result)}"
     yield f"{'':18}{'mean':>12}{'quartiles':>26}{'extremes':>26}{'exact':>12}"
-    for name in QUANTITIES:
+    for name in names:
         found = group.get(name)
         if found:
             quartiles = f"{found['q25']:.5g} to {found['q75']:.5g}"

@@ -16,6 +16,7 @@ import torch
 import erl_torch
 from erl_torch.empirical.uncertainty import Estimate
 from erl_torch.evaluation import Evaluation
+from erl_torch.log.quantities import tagged
 from erl_torch.mdp.tabular import TabularMDP
 from erl_torch.problem import Problem
 from erl_torch.run.judge import episode_model
@@ -33,10 +34,15 @@ class Title:
 
 
 def evaluation_tags(measured: Evaluation, prefix: str = "eval") -> dict[str, float]:
+    return tagged(prefix, figures(measured))
+
+
+def figures(measured: Evaluation) -> dict[str, float]:
+    """By name, as in ``erl_torch.log.quantities``."""
     return {
-        f"{prefix}/return": measured.mean_return,
-        f"{prefix}/reward_per_step": measured.reward_per_step,
-        f"{prefix}/objective": measured.objective,
+        "return": measured.mean_return,
+        "reward_per_step": measured.reward_per_step,
+        "objective": measured.objective,
     }
 
 
@@ -45,27 +51,27 @@ def optimal_tags(optimum: Solution | None, model: TabularMDP | None, problem: Pr
     if optimum is None or optimum.theta is None or optimum.theta_bounds is None:
         return {}
     low, high = optimum.theta_bounds
-    figures = {"theta": optimum.theta, "theta_lower": low, "theta_upper": high}
+    values = {"theta": optimum.theta, "theta_lower": low, "theta_upper": high}
     if optimum.status is Status.CONVERGED:
-        figures |= {"objective": -optimum.theta, "delta_max": optimum.reward_bias_max}
-        figures["delta_mean"] = float(optimum.reward_bias.mean())
+        values |= {"objective": -optimum.theta, "delta_max": optimum.reward_bias_max}
+        values["delta_mean"] = float(optimum.reward_bias.mean())
         if optimum.rho is not None and np.isfinite(optimum.rho):
-            figures["rho"] = optimum.rho
+            values["rho"] = optimum.rho
         if model is not None:
             policy = optimum.policy.numpy()
-            figures["reward_per_step"] = reward_per_step(model, policy, problem.horizon)
+            values["reward_per_step"] = reward_per_step(model, policy, problem.horizon)
             if (episode := episode_model(problem)) is not None:
-                figures["return"] = mean_return(episode, problem.horizon, policy)
-    return {f"optimal/{name}": value for name, value in figures.items()}
+                values["return"] = mean_return(episode, problem.horizon, policy)
+    return tagged("optimal", values)
 
 
 def data_tags(estimate: Estimate | None) -> dict[str, float]:
     if estimate is None or np.isnan(estimate.value):
         return {}
     if estimate.withheld:
-        return {"data/theta": estimate.value}
+        return tagged("data", {"theta": estimate.value})
     low, high = estimate.interval()
-    return {"data/theta": estimate.value, "data/theta_lower": low, "data/theta_upper": high}
+    return tagged("data", {"theta": estimate.value, "theta_lower": low, "theta_upper": high})
 
 
 def mean_return(episode: TabularMDP, horizon: int, policy: np.ndarray) -> float:

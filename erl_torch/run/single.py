@@ -19,6 +19,7 @@ from erl_torch.envs import grid_pictures
 from erl_torch.evaluation import Evaluation, evaluate
 from erl_torch.experience.experience import Experience
 from erl_torch.learners.learner import NonFiniteError, TabularLearner, TabularState
+from erl_torch.log.quantities import QUANTITIES, results, tagged, with_own
 from erl_torch.log.tensorboard import Board, Boards, layout
 from erl_torch.notes import note
 from erl_torch.problem import Policy, Problem
@@ -29,6 +30,7 @@ from erl_torch.run.report import (
     Title,
     data_tags,
     evaluation_tags,
+    figures,
     headline,
     last_rows,
     mean_return,
@@ -129,7 +131,8 @@ class SingleRecorder:
 
     @property
     def boards(self) -> Boards:
-        return layout([*self._names(self.start), *evaluation_tags(self.first)], self._constant)
+        table = with_own(self.learner.quantities)
+        return layout([*self._names(self.start), *evaluation_tags(self.first)], self._constant, table)
 
     def open(self, board: Board, goes_on: bool) -> None:
         board.lines(self._constant)
@@ -146,11 +149,11 @@ class SingleRecorder:
         self._said = self._figures(row)
 
     def _names(self, state: TabularState) -> dict[str, float]:
-        return tags_of(self.learner, state.metrics())
+        return tagged("learner", state.metrics())
 
     def _tags(self, state: TabularState, position: int, row: Row) -> dict[str, float]:
         # A solver has proven nothing at step 0; TensorBoard's band chart wants the same steps in all its tags.
-        logged = {} if self.learner.needs_model and not position else tags_of(self.learner, row)
+        logged = {} if self.learner.needs_model and not position else tagged("learner", row)
         return {tag: value for tag, value in logged.items() if np.isfinite(value)} | evaluation_tags(self.last)
 
     def _draw(self, state: TabularState, position: int, title: str, board: Board) -> None:
@@ -213,8 +216,8 @@ class SingleRecorder:
         rate = position / max(outcome.seconds, 1e-9)
         board.scalars({f"time/{self.learner.unit}_per_second": rate}, position)
         final = {"theta": solution.theta, "gap": solution.gap}
-        ends = {f"Final/{name}": value for name, value in final.items() if value is not None}
-        board.scalars(evaluation_tags(self.last, "Final") | ends, position)
+        ends = {name: value for name, value in final.items() if value is not None}
+        board.scalars(tagged("Final", figures(self.last) | ends), position)
         return solution
 
     def save(self, solution: Solution, directory: Path) -> None:
@@ -235,6 +238,7 @@ class SingleRecorder:
             visits = counts.tally.visits.reshape(self.problem.n_states, self.problem.n_actions)
             states_met = [int(visits.any(1).sum()), self.problem.n_states]
         rho = solution.rho if solution.rho and solution.rho < np.inf else None  # beyond double precision: theta tells
+        delta_max = solution.reward_bias_max
         return {
             "env": self.title.env,
             "learner": self.title.learner,
@@ -242,12 +246,7 @@ class SingleRecorder:
             "seed": self.title.seed,
             "status": solution.status.name.lower(),
             "message": solution.message,
-            "theta": solution.theta,
-            "rho": rho,
-            "reward_bias_max": solution.reward_bias_max,
-            "reward_per_step": self.last.reward_per_step,
-            "objective": self.last.objective,
-            "return": self.last.mean_return,
+            **results({"theta": solution.theta, "rho": rho, "delta_max": delta_max, **figures(self.last)}),
             "theta_bounds": list(solution.theta_bounds) if solution.theta_bounds else None,
             "gap": solution.gap,
             "k": solution.k,
@@ -263,22 +262,23 @@ class SingleRecorder:
         }
 
     def summary(self, result: Mapping[str, Any], directory: Path) -> str:
-        first, last = self.first, self.last
         of_play = "" if self.model is not None else "  (the prior's: an estimate, of the episodes played)"
-        theta, rho = result["theta"], result["rho"]
-        rows = [] if theta is None else [("theta", f"{-first.objective:12.5f}", f"{theta:12.5f}{of_play}")]
-        if rho is not None and "rho" in self.start.metrics():
-            rows.append(("rho", f"{'-':>12}", f"{rho:12.4e}"))
-        rows += [
-            ("reward per step", f"{first.reward_per_step:12.5f}", f"{last.reward_per_step:12.5f}"),
-            ("objective", f"{first.objective:12.5f}", f"{last.objective:12.5f}"),
-            ("episode return", f"{first.mean_return:12.2f}", f"{last.mean_return:12.2f}"),
+        before = {"theta": -self.first.objective, **figures(self.first)}
+        logged = {*self.start.metrics(), *before}
+        rows = [
+            (
+                q.row,
+                f"{before[q.name]:12{q.digits}}" if q.name in before else f"{'-':>12}",
+                f"{result[q.result]:12{q.digits}}" + of_play * (q.name == "theta"),
+            )
+            for q in QUANTITIES
+            if q.digits and q.name in logged and result[q.result] is not None
         ]
         heading = f"{self.title.env}, {self.title.learner}, beta {self.learner.beta:g}, seed {self.title.seed}"
         lines = [
             *headline(heading, result),
             f"{'':18}{'prior':>12}{'learnt':>12}",
-            *(f"{name:18}{before}{after}" for name, before, after in rows),
+            *(f"{name:18}{prior}{learnt}" for name, prior, learnt in rows),
         ]
         if result["theta_bounds"] is not None:
             lines.append(f"{'proven':18}{proven(result['theta_bounds'], result['gap'])}")
@@ -292,12 +292,6 @@ class SingleRecorder:
             k = "" if result["k"] is None else f" (k = {result['k']})"
             lines.append(f"{'iterations':18}{done}{k}")
         return "\n".join([*lines, *last_rows(result, directory)])
-
-
-def tags_of(learner: TabularLearner[Any], row: Row) -> dict[str, float]:
-    """What the learner logs, by tag."""
-    prefix = "exact" if learner.needs_model else "s1" if "psi_error" in row else "learner"
-    return {f"{prefix}/{name}": value for name, value in row.items() if name not in ("epoch", "n_tuples")}
 
 
 def _reach_of_data(result: Mapping[str, Any]) -> str:

@@ -119,7 +119,7 @@ def _common(
     return {
         "problem": problem,
         "saved": saved,
-        "hyperparameters": hyperparameters(cfg, **more),
+        "hyperparameters": hyperparameters(plain(cfg), **more),
         "configuration": OmegaConf.to_yaml(cfg, resolve=True),
         "every": settings.every,
         "talks": True,
