@@ -125,7 +125,7 @@ def bias_picture(
 
 
 def board(grid: GridWorld, cell_px: int = 64) -> np.ndarray:
-    """The bare grid with its wind, for ``render``: cell_px (fewer on large grids) pixels a tile."""
+    """The grid with its wind alone, for ``render``: cell_px pixels per tile, fewer on large grids."""
     rows, cols = grid.shape
     cell_px = max(12, min(cell_px, 1200 // max(rows, cols)))
     figure = Figure(figsize=(cols * cell_px / DPI, rows * cell_px / DPI), dpi=DPI)
