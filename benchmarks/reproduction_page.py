@@ -1,4 +1,4 @@
-"""The page of the reproduction out of full runs.
+"""Write the page of the reproduction from full runs.
 
     python reproduce.py artifact=all scale=full && python benchmarks/reproduction_page.py
 
@@ -24,7 +24,7 @@ FROM, TO, PAGE = (
 MOST_SVG = 300_000  # bytes
 SOURCES = ("printed", "picture", "stated")  # the paper's
 COLUMNS = ("printed", "read off", "computed")
-HEAD = """# The whole paper, one command each
+HEAD = """# The whole paper, one command per artifact
 
     python reproduce.py artifact=NAME                 a small version
     python reproduce.py artifact=NAME scale=full      what this page shows
@@ -32,22 +32,22 @@ HEAD = """# The whole paper, one command each
 
 `NAME` is one of the artifacts below. Numbers come as CSV and JSON, the picture as PNG and SVG, in
 `runs/reproduce/NAME-SCALE-seedSEED`. A run that was stopped or killed goes on with the units of work that are missing.
-The same seed gives the same files for any number of `processes`. On one machine a second run gave, byte for byte, the
-32 files of all figures and of Table S1, and of Table S2's 127 units of work the 115 that were done again: all of the
-three small tasks, and four samples of Acrobot as described. Its other twelve, minutes each, were not. Other processors
-and other versions of NumPy, SciPy and Matplotlib may round the last digits otherwise.
+The same seed gives the same files for any number of `processes`. On one machine a second run gave the same bytes: in
+the 32 files of all figures and of Table S1, and in 115 of the 127 units of work of Table S2, which are all of the three
+small tasks and four samples of Acrobot as described. The other twelve, minutes each, were not done again. Other
+processors and other versions of NumPy, SciPy and Matplotlib may round the last digits otherwise.
 
-**Reproduced** means one thing. A number with no chance in it: equal to half a unit of the last digit given. A mean: the
-difference from ours is no more than 95 % of differences would be were both samples of one law, by its standard error,
-sqrt(e1^2 + e2^2 + d^2/3), where e1 and e2 are the standard errors of both means and d is half a unit of the last digit
-or the error of reading (Student's t, as for normal means). The 95 % are for all lines with chance in them that stand in
-one column of a table, together (Sidak; the thirteenth line of Table S1, a binomial count, is one of them). A single
-count is a mean of one. *Allowed* is that largest difference. What the paper says in words is held against the same
-words, with the threshold named.
+**Reproduced** has one meaning. For a number without chance: ours equals it to half a unit of its last digit. For a
+mean: ours differs from it by no more than 95 % of differences would, if both samples were of one law. The standard
+error of the difference is sqrt(e1^2 + e2^2 + d^2/3), where e1 and e2 are the standard errors of both means and d is
+half a unit of the last digit or the error of reading (Student's t, as for normal means). The 95 % hold for all lines
+with chance in one column of a table together (Sidak; the thirteenth line of Table S1, a binomial count, is one of
+them). A single count is a mean of one. *Allowed* is the largest difference that counts as none. A statement of the
+paper in words is compared with our numbers; the page gives the threshold.
 
 Three columns tell where a value comes from: *printed* in the paper, *read off* one of its pictures, or *computed*
-independently of this package (by us, so no claim of the paper: such a value *agrees* or *differs*, by the same rule).
-"Met" counts the paper's alone.
+independently of this package. Computed values are ours and no claim of the paper: they *agree* or *differ*, by the same
+rule. "Met" counts the paper's values alone.
 
 """
 

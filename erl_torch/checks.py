@@ -44,7 +44,7 @@ class InputError(ValueError):
         self.key, self.value, self.allowed = key, value, allowed
 
     def __str__(self) -> str:
-        return " ".join(f"{self.key}={_shown(self.value)}: must be {self.allowed}".split())
+        return " ".join(f"{self.key}={_text(self.value)}: must be {self.allowed}".split())
 
     def within(self, group: str) -> InputError:
         """The same error with ``group.`` before the key."""
@@ -223,7 +223,7 @@ def _numbers(path: str) -> dict[str, int]:
     return {row[0]: int(row[1]) for row in rows if len(row) > 1 and row[1].isdigit()}
 
 
-def _shown(value: object) -> str:
+def _text(value: object) -> str:
     """``value`` as a text short enough to read; Python writes no number of more than 4,300 digits."""
     if isinstance(value, int) and not isinstance(value, bool) and abs(value) > 10**30:
         return f"{'-' * (value < 0)}1e{math.log10(abs(value)):.0f}"
@@ -251,13 +251,13 @@ def sequence(key: str, value: object) -> tuple[Any, ...]:
     try:
         return tuple(value)  # type: ignore[arg-type]  # TypeError for what has no entries
     except (TypeError, RuntimeError) as error:
-        raise InputError(key, f"{_shown(value)} ({type(value).__name__})", "a list") from error
+        raise InputError(key, f"{_text(value)} ({type(value).__name__})", "a list") from error
 
 
 def instance(key: str, value: object, kind: type | tuple[type, ...], allowed: str) -> None:
     """Raise InputError unless ``value`` is of a class of ``kind``, which ``allowed`` describes."""
     if not isinstance(value, kind):
-        raise InputError(key, f"{_shown(value)} ({type(value).__name__})", allowed)
+        raise InputError(key, f"{_text(value)} ({type(value).__name__})", allowed)
 
 
 def device(key: str, value: object) -> None:
@@ -320,18 +320,18 @@ def real(key: str, value: object) -> np.ndarray:
     return table
 
 
-def sparse(key: str, value: object, shape: Shape, more: str = "") -> sp.csr_array:
+def sparse(key: str, value: object, shape: Shape, hint: str = "") -> sp.csr_array:
     """``value`` [m, n], sparse (scipy's or torch's) or dense, as a new float64 CSR matrix: sorted, without zeros,
     repeated entries summed. Its entries may be infinite, or NaN.
 
-    Raises InputError: as ``array``, and an index out of range; ``more`` completes the message about the shape.
+    Raises InputError: as ``array``, and an index out of range; ``hint`` completes the message about the shape.
     """
     import scipy.sparse as sp
 
     matrix: Any = value  # scipy's classes have no types
     if not is_sparse(value) or (_is_tensor(value) and value.dense_dim() > 0):
         matrix = real(key, value)
-    _check_shape(key, tuple(matrix.shape), shape, more)
+    _check_shape(key, tuple(matrix.shape), shape, hint)
     try:
         if _is_tensor(matrix):
             coo = _cpu(key, matrix).coalesce()
@@ -429,14 +429,14 @@ def _described(value: object, dtype: object) -> str:
     return f"{type(value).__name__} of dtype {dtype}" if value is not None else "None"
 
 
-def _check_shape(key: str, given: tuple[int, ...], shape: Shape, more: str = "") -> None:
+def _check_shape(key: str, given: tuple[int, ...], shape: Shape, hint: str = "") -> None:
     sizes: dict[str, int] = {}
     good = len(given) == len(shape) and all(
         n == wanted if isinstance(wanted, int) else 0 < n == sizes.setdefault(wanted, n)
         for n, wanted in zip(given, shape, strict=True)
     )
     if not good:
-        raise InputError(key, f"array of shape {given}", f"of shape [{', '.join(map(str, shape))}]{more}")
+        raise InputError(key, f"array of shape {given}", f"of shape [{', '.join(map(str, shape))}]{hint}")
 
 
 def room(key: str, shape: tuple[int, ...]) -> None:

@@ -17,7 +17,7 @@ PACKAGE = os.path.dirname(__file__) + os.sep
 
 
 class Note(UserWarning):
-    """The results hold, but for what the text says."""
+    """The results hold, with the reservation that the text names."""
 
 
 def note(text: str) -> None:

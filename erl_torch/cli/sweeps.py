@@ -297,8 +297,7 @@ def _patient_submitit(inner: Launcher, sweep: Path, numbers: Sequence[int]) -> I
 
     map_array = submitit.AutoExecutor.map_array
 
-    # Any: submitit has no types here.
-    def and_wait(self: Any, *arguments: Any) -> list[Finished]:
+    def and_wait(self: object, *arguments: object) -> list[Finished]:
         _wait(sweep, dict(zip(numbers, map_array(self, *arguments), strict=True)))
         return [Finished() for _ in numbers]
 

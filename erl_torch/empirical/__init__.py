@@ -1,1 +1,1 @@
-"""What counts of tuples say: the empirical model, the error of theta, reservations."""
+"""From counts of tuples: the empirical model, the error of theta, reservations."""

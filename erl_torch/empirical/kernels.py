@@ -1,9 +1,6 @@
 """Count tuples into rows, and move rows as far as the counts allow.
 
-Kernels take plain C-contiguous arrays and scalars, use no globals, and validate nothing: the callers do.
-``error_model="numpy"``: a division by zero gives inf or nan for the caller to find, and no check costs time.
-Those that call each other stand in one file: Numba's cache does not notice a changed kernel in another file.
-Pair index: ``k = s * n_actions + a``. Transition matrices come as CSR arrays (indptr, indices, data).
+Conventions as in ``erl_torch.mdp.kernels``.
 """
 
 from __future__ import annotations
@@ -94,8 +91,8 @@ def likelihood_rows(indptr, data, x, slope, moved, cost):
 
     CSR rows p that sum to 1; x [entries]. An entry of probability 0 may be given mass: that of a successor not seen.
     Fills moved with q (as data) and cost [rows] with sum_j p_j log(p_j/q_j). Stationary where q_j = p_j/(eta - y_j),
-    y = slope (x - mean): eta is the root of sum_j q_j = 1 above the largest y, or that y itself, where what is seen
-    leaves mass over.
+    y = slope (x - mean): eta is the root of sum_j q_j = 1 above the largest y, or that y itself, where the successors
+    that were seen leave mass over.
     """
     for row in range(indptr.size - 1):
         first, last = indptr[row], indptr[row + 1]

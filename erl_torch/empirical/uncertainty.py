@@ -130,11 +130,13 @@ class Estimate:
         if self.withheld:
             return f"{self.name} = {self.value:.4g}, no interval: {self.withheld}"
         low, high = self.interval()
-        near = min(self.value - low, high - self.value)
+        distance = min(self.value - low, high - self.value)
         digits = 4
-        if near > 0:
-            first = int(np.floor(np.log10(near)))  # place of its first digit; two digits are printed where that is a 1
-            digits = min(max(0, (near < 2 * 10.0**first) - first), MOST_DIGITS)
+        if distance > 0:
+            first = int(
+                np.floor(np.log10(distance))
+            )  # place of its first digit; two digits are printed where that is a 1
+            digits = min(max(0, (distance < 2 * 10.0**first) - first), MOST_DIGITS)
         # Round so that the printed interval contains the interval.
         unit = 10.0**-digits
         if abs(0.5 * (low + high) - self.value) > LOPSIDED * 0.5 * (high - low):

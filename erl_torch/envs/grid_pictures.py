@@ -93,6 +93,13 @@ def shares(top: float) -> ScalarMappable:
     return ScalarMappable(Normalize(0.0, top), colours)
 
 
+def share_bar(figure: Figure, place: tuple[float, float, float, float], top: float, extend: str = "neither") -> None:
+    """A colour bar of shares of time from 0 to ``top`` at ``place`` (left, bottom, width, height; of the figure)."""
+    bar = figure.colorbar(shares(top), cax=figure.add_axes(place), extend=extend)
+    bar.set_label("share of time", fontsize=8)
+    bar.ax.tick_params(labelsize=7)
+
+
 def bias_picture(
     reward_bias: np.ndarray, grid: GridWorld | None = None, title: str = "", max_px: int = MAX_PX
 ) -> np.ndarray:
@@ -125,7 +132,7 @@ def bias_picture(
 
 
 def board(grid: GridWorld, cell_px: int = 64) -> np.ndarray:
-    """The bare grid with its wind, for ``render``: cell_px (fewer on large grids) pixels a tile."""
+    """The grid with its wind alone, for ``render``: cell_px pixels per tile, fewer on large grids."""
     rows, cols = grid.shape
     cell_px = max(12, min(cell_px, 1200 // max(rows, cols)))
     figure = Figure(figsize=(cols * cell_px / DPI, rows * cell_px / DPI), dpi=DPI)
@@ -208,13 +215,13 @@ def _policy(axes: Axes, grid: GridWorld, policy: np.ndarray) -> None:
     free = np.flatnonzero(~np.isin(grid.tiles, ["H", "G", "W"]))
     row, col = np.divmod(free, grid.shape[1])
     for move, probability in zip(grid.moves, policy[free].T, strict=True):
-        shown = probability > 0.02
+        visible = probability > 0.02
         if not move.any():
-            for x, y, p in zip(col[shown], row[shown], probability[shown], strict=True):
+            for x, y, p in zip(col[visible], row[visible], probability[visible], strict=True):
                 axes.add_patch(Circle((x, y), 0.2 * p, color=ARROW, zorder=3))
             continue
-        dy, dx = move[:, None] * 0.46 * probability[shown]
+        dy, dx = move[:, None] * 0.46 * probability[visible]
         axes.quiver(
-            col[shown], row[shown], dx, dy, angles="xy", scale_units="xy", units="xy", scale=1, color=ARROW,
+            col[visible], row[visible], dx, dy, angles="xy", scale_units="xy", units="xy", scale=1, color=ARROW,
             width=0.06, headwidth=3.5, headlength=3.5, headaxislength=3, minlength=0.2, zorder=3,
         )  # fmt: skip

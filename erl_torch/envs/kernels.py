@@ -1,9 +1,6 @@
 """Random winds, and a model counted from samples.
 
-Kernels take plain C-contiguous arrays and scalars, use no globals, and validate nothing: the callers do.
-``error_model="numpy"``: a division by zero gives inf or nan for the caller to find, and no check costs time.
-Those that call each other stand in one file: Numba's cache does not notice a changed kernel in another file.
-Pair index: ``k = s * n_actions + a``. Transition matrices come as CSR arrays (indptr, indices, data).
+Conventions as in ``erl_torch.mdp.kernels``.
 """
 
 from __future__ import annotations

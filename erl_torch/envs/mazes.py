@@ -51,7 +51,7 @@ def random_mazes(
     trap_reward: float = -2.0,
     lowest_angle: float = 0.0,
 ) -> Iterator[GridWorld]:
-    """``n`` random mazes; the i-th of ``seed`` is the same whatever ``n``.
+    """``n`` random mazes; the i-th of ``seed`` does not depend on ``n``.
 
     Args:
         n: whole number >= 0.

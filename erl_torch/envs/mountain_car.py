@@ -31,7 +31,7 @@ TASK = ControlTask(
     reset_low=(-0.6, 0.0),
     reset_high=(-0.4, 0.0),
     step=step,
-    # Of the state that is reached, whatever its velocity: the flag itself pays.
+    # The reward of the state that is reached, at any velocity: reaching the flag pays.
     instant_reward=lambda state, step: torch.where(step.state[:, 0] >= GOAL, 0.0, step.reward),
     variables=lambda state: state,
 )

@@ -18,6 +18,7 @@ same. Entries of P with the same s' are summed. Time limits are not part of a mo
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -29,6 +30,8 @@ from numpy.typing import ArrayLike
 from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.mdp.tabular import TabularMDP, normalise_rows
+
+Table = Mapping[int, Mapping[int, Sequence[tuple[float, int, float, bool]]]]  # P, as it should be
 
 # Wrappers that leave states, actions, rewards and dynamics as they are.
 NEUTRAL = (
@@ -84,12 +87,12 @@ def ending_states(env: gym.Env[Any, Any], n_states: int) -> np.ndarray:
     return np.asarray(getattr(env.unwrapped, "ends", np.zeros(n_states, bool)))
 
 
-def _table(env: gym.Env[Any, Any]) -> Any:  # nothing is promised of it: ``_entries`` checks all that it reads
-    """``P``. Raises InputError where there is none, or where it does not tell of the passenger's moods (Taxi)."""
+def _table(env: gym.Env[Any, Any]) -> Table:
+    """``P``, as it is. Raises InputError where there is none, or where it leaves out part of the process (Taxi)."""
     base = env.unwrapped
     if getattr(base, "fickle_passenger", False):
         raise InputError("fickle_passenger", True, "False: P does not tell of it (learn from env.step instead)")
-    table = getattr(base, "P", None)
+    table: Table | None = getattr(base, "P", None)
     if table is None:
         raise InputError("env", base, "one that has its model as P or mdp (learn from env.step instead)")
     return table
@@ -175,8 +178,8 @@ def changed_by(env: gym.Env[Any, Any]) -> str | None:
     return None
 
 
-def _entries(table: Any, n_states: int, n_actions: int) -> tuple[np.ndarray, ...]:  # Any: as ``_table``
-    """(pair, s', probability, reward, terminated) of every entry of ``P``."""
+def _entries(table: Table, n_states: int, n_actions: int) -> tuple[np.ndarray, ...]:
+    """(pair, s', probability, reward, terminated) of every entry. Raises InputError for a table of another form."""
     try:
         entries = [
             (s * n_actions + a, to, p, r, bool(end))

@@ -1,9 +1,9 @@
 """Sums of rows, with an error that does not grow with their length.
 
-Kernels take plain C-contiguous arrays and scalars, use no globals, and validate nothing: the callers do.
-``error_model="numpy"``: a division by zero gives inf or nan for the caller to find, and no check costs time.
-Those that call each other stand in one file: Numba's cache does not notice a changed kernel in another file.
-Pair index: ``k = s * n_actions + a``. Transition matrices come as CSR arrays (indptr, indices, data).
+Kernels, here and in the other rooms, take plain C-contiguous arrays and scalars, use no globals, and validate nothing:
+the callers do. ``error_model="numpy"``: a division by zero gives inf or nan, which the caller checks, and no check costs
+time. Kernels that call each other stand in one file, because Numba's cache does not notice a changed kernel in another
+file. Pair index: ``k = s * n_actions + a``. Transition matrices come as CSR arrays (indptr, indices, data).
 """
 
 from __future__ import annotations

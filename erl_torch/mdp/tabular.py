@@ -93,13 +93,13 @@ class TabularMDP:
         """Read what ``save`` wrote, or any npz with ``transition`` (or its CSR parts), ``reward`` and, unless uniform,
         ``start``; ``normalise`` as in the constructor. Raises InputError naming the file."""
         arrays = read_npz(path)
-        parts = [f"transition_{name}" for name in CSR_PARTS]
-        if "reward" not in arrays or not ("transition" in arrays or all(part in arrays for part in parts)):
-            raise InputError("path", path, f"an npz with reward and transition (or {', '.join(parts)})")
+        names = [f"transition_{name}" for name in CSR_PARTS]
+        if "reward" not in arrays or not ("transition" in arrays or all(name in arrays for name in names)):
+            raise InputError("path", path, f"an npz with reward and transition (or {', '.join(names)})")
         try:
             transition = arrays.get("transition")
             if transition is None:
-                transition = _csr_of_parts([arrays[part] for part in parts], arrays["reward"].shape)
+                transition = _csr_of_parts([arrays[name] for name in names], arrays["reward"].shape)
             return cls(transition, arrays["reward"], arrays.get("start"), normalise)  # type: ignore[arg-type]
         except InputError as error:
             raise error.of_file(path) from error
@@ -175,13 +175,13 @@ def _csr_of_parts(parts: Sequence[np.ndarray], sizes: tuple[int, ...]) -> sp.csr
 
 def _csr(value: object, n_states: int, n_actions: int) -> sp.csr_array:
     shape = (n_states * n_actions, n_states)
-    more = " ([S*A, S])"
+    hint = " ([S*A, S])"
     if not checks.is_sparse(value):
         table = checks.real("transition", value)
         value = table.reshape(shape) if table.shape == (n_states, n_actions, n_states) else table
-        more += f" or [{n_states}, {n_actions}, {n_states}] ([S, A, S])"
-    more += f", as reward is [{n_states}, {n_actions}] ([S, A]): one of the two is wrong"
-    return checks.sparse("transition", value, shape, more)
+        hint += f" or [{n_states}, {n_actions}, {n_states}] ([S, A, S])"
+    hint += f", as reward is [{n_states}, {n_actions}] ([S, A]): one of the two is wrong"
+    return checks.sparse("transition", value, shape, hint)
 
 
 def _row_name(row: int, n_actions: int) -> str:

@@ -9,7 +9,7 @@ import scipy.sparse as sp
 from matplotlib.figure import Figure
 
 from erl_torch import perron, solve_soft_bellman
-from erl_torch.envs.grid_pictures import draw_grid, shares
+from erl_torch.envs.grid_pictures import draw_grid, share_bar
 from erl_torch.envs.windy_cliff import WindyCliffEnv
 from erl_torch.mdp.tabular import TabularMDP
 from erl_torch.reproduction.artifact import (
@@ -175,9 +175,7 @@ def _figure(cliff: dict[str, np.ndarray], gap: dict[str, float]) -> Figure:
             }.get(what or "", "")
             axes.text(1, 4.62, below, fontsize=8, ha="center", va="top")
             axes.set_title(head, fontsize=9.5)
-    bar = figure.colorbar(shares(TOP), cax=figure.add_axes((0.925, 0.12, 0.012, 0.66)), extend="max")
-    bar.set_label("share of time", fontsize=8)
-    bar.ax.tick_params(labelsize=7)
+    share_bar(figure, (0.925, 0.12, 0.012, 0.66), TOP, extend="max")
     return figure
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from erl_torch import iterate_biasing
-from erl_torch.envs.grid_pictures import draw_grid, shares
+from erl_torch.envs.grid_pictures import draw_grid, share_bar
 from erl_torch.envs.mazes import random_maze
 from erl_torch.pictures import COLOURS
 from erl_torch.reproduction.artifact import (
@@ -93,9 +93,7 @@ def _figure(result: dict[str, np.ndarray], maze_seed: int, worst: np.ndarray, me
         draw_grid(axes, grid, **content)
         axes.set_title(title, fontsize=10)
     top = float(result["distribution"].max())
-    bar = figure.colorbar(shares(top), cax=figure.add_axes((0.455, 0.08, 0.01, 0.3)))
-    bar.set_label("share of time", fontsize=8)
-    bar.ax.tick_params(labelsize=7)
+    share_bar(figure, (0.455, 0.08, 0.01, 0.3), top)
     axes = figure.add_axes((0.595, 0.075, 0.36, 0.345))
     k = np.arange(worst.shape[1])
     for values, colour, name in ((worst, COLOURS[1], "largest of all states"), (mean, COLOURS[0], "mean over states")):

@@ -10,7 +10,7 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from erl_torch import solve_biasing, solve_soft_bellman
-from erl_torch.envs.grid_pictures import draw_grid, shares
+from erl_torch.envs.grid_pictures import draw_grid, share_bar
 from erl_torch.envs.shift import dynamics_shift
 from erl_torch.reproduction.artifact import ORACLE, Artifact, Comparison, Output, Results, Units, compared
 from erl_torch.solvers.policy import induced_distribution, reward_per_step
@@ -78,17 +78,15 @@ def assemble(results: Results, scale: str) -> Output:
             draw_grid(axes, grid, result[f"{name}_policy"], result[f"{name}_distribution"], TOP)
             axes.set_title(f"{title}\nreturn {value:.2f}", fontsize=9.5)
         figure.text(0.022, 0.68 - 0.46 * i, f"up works with {chance}", rotation=90, va="center", fontsize=10)
-    bar = figure.colorbar(shares(TOP), cax=figure.add_axes((0.925, 0.12, 0.012, 0.66)), extend="max")
-    bar.set_label("share of time", fontsize=8)
-    bar.ax.tick_params(labelsize=7)
+    share_bar(figure, (0.925, 0.12, 0.012, 0.66), TOP, extend="max")
     reading = [
         '"up" succeeds with probability 1e-4 after the shift (the script of May 2022, which made the published '
         "figure); .01, as the script of June 2023 has it, stands beside it.",
         "Returns are exact expectations over 1000 steps from S, undiscounted.",
     ]
     data = {
-        name: {"theta_bounds": it["theta_bounds"].tolist(), "iterations": int(it["n_iterations"]), "k": int(it["k"])}
-        for name, it in results.items()
+        name: {"theta_bounds": own["theta_bounds"].tolist(), "iterations": int(own["n_iterations"]), "k": int(own["k"])}
+        for name, own in results.items()
     }
     return Output(rows, comparisons, figure, reading, {"solutions": data})
 

@@ -106,9 +106,9 @@ def solve_log_perron(
     of the pattern, where the caller has it.
     """
 
-    def power(h: np.ndarray, steps: int, near: float) -> _Point:
+    def power(h: np.ndarray, steps: int, spread: float) -> _Point:
         h, gain, chain = h.copy(), np.full(len(h), np.nan), np.full(len(ind), np.nan)
-        kernels.lazy_log_steps(ptr, ind, log_m, h, gain, chain, steps, near)
+        kernels.lazy_log_steps(ptr, ind, log_m, h, gain, chain, steps, spread)
         return _Point(h, gain, sp.csr_array((chain, ind, ptr), shape=(len(h), len(h))))
 
     def newton(at: _Point, lu: RegenerativeLU) -> _Point:

@@ -1,10 +1,7 @@
 """Compiled loops of the exact solvers: elimination without subtraction, Newton's method on a fixed pattern, tilted
 dynamics.
 
-Kernels take plain C-contiguous arrays and scalars, use no globals, and validate nothing: the callers do.
-``error_model="numpy"``: a division by zero gives inf or nan for the caller to find, and no check costs time.
-Those that call each other stand in one file: Numba's cache does not notice a changed kernel in another file.
-Pair index: ``k = s * n_actions + a``. Transition matrices come as CSR arrays (indptr, indices, data).
+Conventions as in ``erl_torch.mdp.kernels``.
 """
 
 from __future__ import annotations
@@ -334,13 +331,13 @@ def log_gains(ptr, ind, log_m, h, gain, chain):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def lazy_log_steps(ptr, ind, log_m, h, gain, chain, steps, near):
-    """Power steps on exp(h) in logarithms, averaged with standing still (no period can catch them), until the gains
-    differ by less than ``near`` or there were ``steps``. h changes in place; gain, chain and what is returned are those
-    of ``log_gains`` there."""
+def lazy_log_steps(ptr, ind, log_m, h, gain, chain, steps, spread):
+    """Make power steps on exp(h) in logarithms, averaged with standing still (so no period can catch them), until the
+    gains differ by less than ``spread``, ``steps`` at most. h changes in place; gain, chain and the returned pair are
+    those of ``log_gains`` there."""
     low, high = log_gains(ptr, ind, log_m, h, gain, chain)
     for _ in range(steps):
-        if high - low < near or not np.isfinite(high - low):
+        if high - low < spread or not np.isfinite(high - low):
             break
         mean = np.mean(gain)
         for s in range(h.size):
