@@ -9,12 +9,13 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 import scipy.sparse as sp
+from numpy.typing import ArrayLike
 
 from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.experience import kernels as experience_kernels
 from erl_torch.experience.collect import batched
-from erl_torch.experience.play import draw_action, episode, reset
+from erl_torch.experience.play import Plan, draw_action, episode, reset
 from erl_torch.experience.sampling import policy_cdf, sampling_tables
 from erl_torch.mdp.from_gymnasium import known_mdp, sizes
 from erl_torch.mdp.tabular import TabularMDP, check_policy, check_prior
@@ -35,12 +36,12 @@ class Evaluation(NamedTuple):
 
 def evaluate(
     source: TabularMDP | gym.Env[Any, Any],
-    policy: Any,
+    policy: ArrayLike,
     beta: float,
     rng: np.random.Generator,
     n_episodes: int = 20,
     horizon: int = 1000,
-    prior_policy: Any = None,
+    prior_policy: ArrayLike | None = None,
     mdp: TabularMDP | None = None,
     mean_return: Callable[[np.ndarray], float] | None = None,
 ) -> Evaluation:
@@ -156,7 +157,8 @@ def _evaluate_by_playing(
     kl = kl_per_state(policy, prior)
     batch = batched(env)
     if batch is not None:
-        data = batch(n_episodes, horizon, seed=Streams(rng, rng, rng), behaviour_policy=policy, reward="original")
+        uniform = np.full(policy.shape, 1 / policy.shape[1])  # a' is drawn, and not looked at
+        data = batch(Plan(n_episodes, horizon, Streams(rng, rng, rng), policy, uniform, False), "original")
         return Evaluation(data.r.sum() / n_episodes, data.r.mean(), float((data.r - kl[data.s] / beta).mean()))
     choose = partial(draw_action, np.cumsum(policy, axis=1), rng)
     total = total_kl = 0.0

@@ -7,7 +7,6 @@ import zlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -16,6 +15,7 @@ from erl_torch.checks import InputError
 from erl_torch.files import read_npz, write_npz
 
 COLUMNS = ("s", "a", "r", "s_next", "a_next")
+TYPES = {name: np.dtype("<f8" if name == "r" else "<i4") for name in COLUMNS}  # in files
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +56,7 @@ class Transitions:
         """The first ``n`` tuples."""
         return self.where(slice(n))
 
-    def where(self, rows: Any) -> Transitions:
+    def where(self, rows: slice | np.ndarray) -> Transitions:
         """The tuples of a slice or mask; at least one."""
         return Transitions.checked(*(getattr(self, name)[rows] for name in COLUMNS))
 
@@ -145,7 +145,7 @@ def join(chunks: list[Transitions]) -> Transitions:
     return Transitions.checked(*(np.concatenate([getattr(chunk, name) for chunk in chunks]) for name in COLUMNS))
 
 
-def _column(name: str, value: Any) -> np.ndarray:
+def _column(name: str, value: object) -> np.ndarray:
     column = checks.real(name, value)
     if column.ndim != 1:
         raise InputError(name, f"array of shape {column.shape}", "one-dimensional")
