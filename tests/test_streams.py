@@ -301,6 +301,24 @@ def test_a_format_of_ones_own(tmp_path):
         read_experience(tmp_path / "t.txt", 5, 3, format=csv)
 
 
+@pytest.mark.parametrize("change", [{"r": None}, {"r": np.ones(39)}, {"s": np.ones((40, 1), int)}])
+def test_what_a_format_reads_must_be_five_columns(change):
+    class Broken:
+        path, short = "t", 0
+
+        def claims(self, path):
+            return True
+
+        def reader(self, path, options):
+            return self
+
+        def batches(self, rows, strict):
+            yield {**vars(SHORT), **change}
+
+    with pytest.raises(InputError, match=r"^path=t=shapes .* from row 0 on: must be five columns of one length"):
+        read_experience("t", 5, 3, format=Broken())
+
+
 def test_a_failure_names_its_tuple_wherever_it_is_read_from():
     data = Transitions(PLAIN.s, PLAIN.a, PLAIN.r.copy(), PLAIN.s_next, PLAIN.a_next)
     data.r[7777:] -= 300.0
