@@ -715,7 +715,7 @@ MUTANTS = [
     Mutant(
         "the checksum is of the last chunk",
         "experience/transitions.py",
-        "zlib.crc32(memoryview(getattr(chunk, name)), found)",
+        "zlib.crc32(memoryview(getattr(chunk, name)), crc)",
         "zlib.crc32(memoryview(getattr(chunk, name)))",
         "test_streams.py::test_files_are_the_stream_in_memory",
     ),
@@ -1268,8 +1268,8 @@ MUTANTS = [
     Mutant(
         "a selection takes what is left out",
         "experience/experience.py",
-        "(chunk.where(mask) for chunk, mask in found if mask.any())",
-        "(chunk.where(~mask) for chunk, mask in found if not mask.all())",
+        "(chunk.where(mask) for chunk, mask in masked if mask.any())",
+        "(chunk.where(~mask) for chunk, mask in masked if not mask.all())",
         "test_streams.py::test_learners_do_not_see_how_a_stream_is_cut",
     ),
     Mutant(

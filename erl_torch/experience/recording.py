@@ -46,7 +46,7 @@ class FileRecording:
         path: see the module's docstring.
         n_states, n_actions: sizes of the problem.
         on_bad: "stop" or "skip", for bad tuples.
-        chunk: tuples at a time at most (but for what a learner handles at once, some thousands), in ``held`` too.
+        chunk: tuples in memory at most, >= 1 (some thousands, if a learner has to have so many at once).
         env, prior_policy, on_prior, seed: for Minari: the environment whose bins serve where the spaces are Box, and
             where a' comes from.
         report: called with the number of tuples read so far.
@@ -55,7 +55,7 @@ class FileRecording:
     Raises:
         InputError: what is wrong, with file and row.
 
-    Attributes: ``n_skipped`` bad tuples are left out, ``first_skipped`` is the first of them, as text.
+    Attributes: ``n_skipped`` counts the bad tuples that are left out, ``first_skipped`` names the first of them.
     """
 
     def __init__(
@@ -108,12 +108,12 @@ class FileRecording:
         return self._n
 
     def check_range(self, n_states: int, n_actions: int) -> None:
-        """Every pass has been, and is, checked against the sizes it was opened with. Raises InputError for others."""
+        """Raise InputError for sizes below those it was opened with, against which every pass checks the tuples."""
         if n_states < self._sizes[0] or n_actions < self._sizes[1]:
             raise InputError("n_states, n_actions", (n_states, n_actions), f"those it was opened with, {self._sizes}")
 
     def chunks(self, multiple: int = 1) -> Iterator[Transitions]:
-        """One pass; see ``Experience``. Raises InputError for a file that is no longer what it was."""
+        """Make one pass, as ``Experience`` says. Raises InputError for a file that is no longer what it was."""
         n = 0
         for block in regroup(self._read(max(1, min(self._chunk, READ) // multiple) * multiple), multiple):
             n += len(block)
@@ -125,11 +125,11 @@ class FileRecording:
         return self._checksum
 
     def load(self) -> Transitions:
-        """All of it, in memory."""
+        """All its tuples, in memory."""
         return join(list(self.chunks()))
 
     def held(self) -> Transitions | FileRecording:
-        """In memory where it is no longer than a chunk, else as it is."""
+        """Its tuples in memory where ``chunk`` of them are enough, else itself."""
         return self.load() if len(self) <= self._chunk else self
 
     def _read(self, rows: int) -> Iterator[Transitions]:

@@ -1,7 +1,7 @@
 """Episodes of control tasks in their original, continuous dynamics, many at once.
 
 The action is a draw from policy(.|cell of the state). An episode ends where the original terminates, or after
-``max_steps``. Episodes advance together, one batched step of the dynamics at a time; each keeps its own column of
+``max_steps``. Episodes advance together, one batched step of the dynamics at a time; each has its own column of
 random numbers.
 """
 

@@ -62,7 +62,7 @@ class Transitions:
 
     @classmethod
     def checked(cls, *columns: np.ndarray) -> Transitions:
-        """Of columns that are known to be right, types and lengths included: nothing is looked at again."""
+        """Make them of columns that are known to be right, types and lengths included. Nothing is checked again."""
         if not len(columns[0]):
             raise InputError("transitions", "0 tuples", "at least one tuple")
         new = object.__new__(cls)
@@ -71,7 +71,7 @@ class Transitions:
         return new
 
     def chunks(self, multiple: int = 1) -> Iterator[Transitions]:
-        """Itself: the one chunk."""
+        """Yield itself, the one chunk."""
         yield self
 
     def checksum(self) -> int:
@@ -116,8 +116,8 @@ class Checksum:
 
     def of(self, chunk: Transitions) -> int:
         """The checksum of all chunks so far, this one included."""
-        for name, found in self.columns.items():
-            self.columns[name] = zlib.crc32(memoryview(getattr(chunk, name)), found)
+        for name, crc in self.columns.items():
+            self.columns[name] = zlib.crc32(memoryview(getattr(chunk, name)), crc)
         return zlib.crc32(np.array(list(self.columns.values()), "<u4").tobytes())
 
 
@@ -139,7 +139,7 @@ def regroup(chunks: Iterable[Transitions], multiple: int) -> Iterator[Transition
 
 
 def join(chunks: list[Transitions]) -> Transitions:
-    """Chunks as one."""
+    """The tuples of ``chunks``, in order, as one."""
     if len(chunks) == 1:
         return chunks[0]
     return Transitions.checked(*(np.concatenate([getattr(chunk, name) for chunk in chunks]) for name in COLUMNS))

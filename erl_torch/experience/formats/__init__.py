@@ -1,4 +1,4 @@
-"""File formats of experience, one module per format; ``FORMATS`` are asked in turn which of them reads a path."""
+"""File formats of experience, one module per format; the first of ``FORMATS`` that claims a path reads it."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ Batch = dict[str, np.ndarray]
 
 
 class Options(NamedTuple):
-    """What a format may have to know beside the path, to make tuples of what is recorded."""
+    """What a format may need beside the path, to make tuples of what is recorded."""
 
     n_states: int
     n_actions: int

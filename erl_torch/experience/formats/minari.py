@@ -94,7 +94,7 @@ class Minari:
             yield _joined(ready)
 
     def _ended(self, batch: Batch, x: np.ndarray, terminated: bool, begins: tuple[int, int]) -> Batch:
-        """An episode whose end leads to what ``begins`` next, and its a'."""
+        """An episode with a', and with s' of its end: both depend on the (s, a) with which the next one ``begins``."""
         s_next = batch["s_next"].copy()
         if terminated:
             s_next[-1] = begins[0]

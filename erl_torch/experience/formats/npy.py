@@ -22,7 +22,7 @@ from erl_torch.files import check_directory
 
 
 def claims(path: str) -> bool:
-    """All that exists, so that every other format is asked first."""
+    """All that exists, so that every other format has to be asked before."""
     return Path(path).exists()
 
 
@@ -119,13 +119,13 @@ class Column:
 
 
 class ColumnWriter:
-    """Writes tuples to a directory of npy columns, in memory of a chunk; it has its name once it is complete.
+    """Writes tuples to a directory of npy columns, in the memory of one chunk.
 
         with ColumnWriter("tuples") as writer:
             writer.append(chunk)
 
-    A directory of columns that has the name already is replaced, once the new one is whole. Raises InputError for one
-    that holds anything else, and for a link.
+    The directory gets its name once it is whole. One of columns that has the name already is replaced then. Raises
+    InputError for one that holds anything else, and for a link.
     """
 
     def __init__(self, directory: str | os.PathLike[str]) -> None:
@@ -164,7 +164,7 @@ class ColumnWriter:
             shutil.rmtree(self._temporary, ignore_errors=True)
 
     def _take_name(self) -> None:
-        """A directory that holds something cannot be renamed onto: the old one steps aside, and goes last."""
+        """Rename the old directory, then the new one, and remove the old one last: a full one cannot be replaced."""
         aside = self.directory.with_name(f".{self.directory.name}.{os.getpid()}.old")
         if self.directory.exists():
             os.rename(self.directory, aside)
@@ -179,16 +179,16 @@ class ColumnWriter:
     def _head(self) -> None:
         for name, file in self._files.items():
             file.seek(0)
-            # Room for any length is left, so that what follows stays where it is.
+            # NumPy leaves room for any length, so that the numbers below stay where they are.
             npy.write_array_header_1_0(
                 file, {"descr": TYPES[name].str, "fortran_order": False, "shape": (self._n,)}
             )  # fmt: skip
 
 
 def check_target(key: str, path: str | os.PathLike[str]) -> None:
-    """Raise InputError unless a recording may be written to ``path``: nothing is there, or a recording of ours.
+    """Raise InputError unless experience may be written to ``path``: nothing is there, or experience in our own format.
 
-    A directory is of columns and may be empty, a file an npz of the five columns and no more; neither is a link.
+    That is a directory of the five columns, or an empty one, or an npz of the five columns; a link is neither.
     """
     target = Path(path)
     of_columns = key == "directory" or str(path).endswith("/")
