@@ -135,7 +135,7 @@ class FileRecording:
     def _read(self, rows: int) -> Iterator[Transitions]:
         row = 0
         for batch in self._reader.batches(rows, self._strict):
-            shapes = {name: np.shape(batch.get(name)) for name in COLUMNS}  # () of a column that is not there
+            shapes = {name: np.shape(batch[name]) if name in batch else () for name in COLUMNS}
             if len(shapes["s"]) != 1 or len(set(shapes.values())) > 1:
                 raise InputError(
                     f"path={self.path}", f"shapes {shapes} from row {row} on", "five columns of one length"
