@@ -30,7 +30,8 @@ from erl_torch import AlgorithmS1, CertaintyEquivalence, EfficientS1, Transition
 from erl_torch.empirical import reservations
 from erl_torch.envs.windy_cliff import WindyCliffEnv
 from erl_torch.experience.experience import Experience
-from erl_torch.experience.recording import ColumnWriter, read_experience
+from erl_torch.experience.formats.npy import ColumnWriter
+from erl_torch.experience.recording import read_experience
 from erl_torch.learners.s1 import kernels, listing
 from erl_torch.learners.s1.algorithm import S1Stream
 

@@ -1,4 +1,4 @@
-"""Policies judged: by a known model (``erl_torch.solvers.policy``) or by playing, and beside the optimum."""
+"""Policies, evaluated on a known model (``erl_torch.solvers.policy``) or by playing episodes."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 import scipy.sparse as sp
+from numpy.typing import ArrayLike
 
 from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.experience import kernels as experience_kernels
 from erl_torch.experience.collect import batched
-from erl_torch.experience.play import draw_action, episode, reset
+from erl_torch.experience.play import Plan, draw_action, episode, reset
 from erl_torch.experience.sampling import policy_cdf, sampling_tables
 from erl_torch.mdp.from_gymnasium import known_mdp, sizes
 from erl_torch.mdp.tabular import TabularMDP, check_policy, check_prior
@@ -35,18 +36,18 @@ class Evaluation(NamedTuple):
 
 def evaluate(
     source: TabularMDP | gym.Env[Any, Any],
-    policy: Any,
+    policy: ArrayLike,
     beta: float,
     rng: np.random.Generator,
     n_episodes: int = 20,
     horizon: int = 1000,
-    prior_policy: Any = None,
+    prior_policy: ArrayLike | None = None,
     mdp: TabularMDP | None = None,
     mean_return: Callable[[np.ndarray], float] | None = None,
 ) -> Evaluation:
     """Evaluate ``policy`` [S, A]: on the model where it is known, by playing episodes otherwise.
 
-    On the model, reward per step and objective are exact but for rounding, and but for what ``objective`` says.
+    On the model, reward per step and objective are exact up to rounding, with the exceptions that ``objective`` names.
 
     Args:
         source: where the episodes are played; they end after ``horizon`` steps, or where the environment ends them.
@@ -57,7 +58,7 @@ def evaluate(
         horizon: whole number >= 1, steps of an episode, and of the exact reward per step.
         prior_policy: [S, A], entries > 0; None is uniform.
         mdp: the model behind reward per step and objective; None is ``known_mdp(source)``.
-        mean_return: finds the mean return of a policy [S, A], in place of episodes played in ``source``.
+        mean_return: computes the mean return of a policy [S, A]; no episodes are played then.
 
     Raises:
         InputError: an argument out of range, a policy or prior that is not [S, A], or a model of other sizes.
@@ -73,14 +74,14 @@ def evaluate(
             raise InputError("mdp", f"MDP of shape {mdp.reward.shape}", f"of shape [{n_states}, {n_actions}]")
     table = check_policy("policy", policy, n_states, n_actions)
     prior = check_prior("prior_policy", prior_policy, n_states, n_actions)
-    known = known_mdp(source)
-    model = known if mdp is None else mdp
+    own_mdp = known_mdp(source)
+    model = own_mdp if mdp is None else mdp
     endless = isinstance(source, TabularMDP) or not getattr(source.unwrapped, "ends", np.zeros(1)).any()
     if model is not None and mean_return is not None:
         played = mean_return(table)
-    elif known is not None and endless:
+    elif own_mdp is not None and endless:
         returns = np.empty(n_episodes)
-        experience_kernels.simulate_returns(*sampling_tables(known), policy_cdf(table), horizon, rng, returns)
+        experience_kernels.simulate_returns(*sampling_tables(own_mdp), policy_cdf(table), horizon, rng, returns)
         played = float(returns.mean())
     else:
         assert not isinstance(source, TabularMDP)
@@ -92,7 +93,7 @@ def evaluate(
 
 
 class Judge:
-    """Exact figures of many policies of one model, each in compiled code that other threads can run beside.
+    """Exact figures of many policies of one model, in compiled code that does not hold other threads up.
 
     Args:
         mdp: the model.
@@ -105,7 +106,7 @@ class Judge:
         n_states, n_actions = prior.shape
         p = mdp.transition
         n = p.nnz
-        # Where each transition stands in the chain of a policy: the same for all policies.
+        # The place of each transition in the chain of a policy is the same for all policies.
         marked = sp.csr_array((np.ones(n), p.indices.copy(), p.indptr[::n_actions].copy()), shape=(n_states, n_states))
         marked.sum_duplicates()
         self._rows, self._columns = marked.indptr, marked.indices
@@ -118,7 +119,7 @@ class Judge:
         self._small = closed.sum() == 1 and len(self._inside) <= GTH_STATES
 
     def reward_per_step(self, policy: np.ndarray) -> float:
-        """As the function of that name, for a policy [S, A]."""
+        """``reward_per_step`` of a policy [S, A] over the horizon."""
         reward = (policy * self.mdp.reward).sum(1)
         chain = self._chain(policy)
         total = solvers_kernels.finite_horizon_return(
@@ -127,7 +128,7 @@ class Judge:
         return float(total) / self.horizon
 
     def objective(self, policy: np.ndarray, beta: float) -> float:
-        """As the function of that name."""
+        """``objective`` of a policy [S, A]."""
         if self._small and (policy > 0).all():
             chain = sp.csr_array((self._chain(policy), self._columns, self._rows))
             share, sound = solvers_kernels.gth(chain[self._inside][:, self._inside].toarray())
@@ -156,7 +157,8 @@ def _evaluate_by_playing(
     kl = kl_per_state(policy, prior)
     batch = batched(env)
     if batch is not None:
-        data = batch(n_episodes, horizon, seed=Streams(rng, rng, rng), behaviour_policy=policy, reward="original")
+        uniform = np.full(policy.shape, 1 / policy.shape[1])  # a' is drawn, and not looked at
+        data = batch(Plan(n_episodes, horizon, Streams(rng, rng, rng), policy, uniform, False), "original")
         return Evaluation(data.r.sum() / n_episodes, data.r.mean(), float((data.r - kl[data.s] / beta).mean()))
     choose = partial(draw_action, np.cumsum(policy, axis=1), rng)
     total = total_kl = 0.0

@@ -5,8 +5,10 @@ import io
 import json
 import os
 import re
+import runpy
 import warnings
 from dataclasses import fields
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -30,12 +32,17 @@ from erl_torch.empirical.counts import empirical_mdp, tally
 from erl_torch.envs.discretise import Discretise
 from erl_torch.experience.collect import record
 from erl_torch.experience.experience import Parts
-from erl_torch.experience.recording import ColumnWriter, FileRecording, _Minari, check_target
+from erl_torch.experience.formats import FORMATS
+from erl_torch.experience.formats.format import Options
+from erl_torch.experience.formats.minari import Minari
+from erl_torch.experience.formats.npy import ColumnWriter, check_target
+from erl_torch.experience.recording import FileRecording
 from erl_torch.experience.transitions import COLUMNS, regroup
 from erl_torch.learners import LEARNERS
 from erl_torch.rng import streams
 from erl_torch.run.training import train
 
+ROOT = Path(__file__).parents[1]
 MDP = random_mdp(np.random.default_rng(0), 5, 3)
 PLAIN = collect(MDP, 13, 1000, 1)
 NOISY = Transitions(
@@ -256,6 +263,62 @@ def test_refusals(tmp_path):
         AlgorithmS1().fit(found, 5, 3)
 
 
+@pytest.mark.parametrize(
+    ("path", "format"),
+    [("minari:t.parquet", "minari"), ("t.parquet", "parquet"), ("t.npz", "npy"), ("t", "npy"), ("d.parquet", "npy")],
+)
+def test_the_first_format_that_claims_a_path_reads_it(tmp_path, monkeypatch, path, format):
+    monkeypatch.chdir(tmp_path)
+    for name in ("t.parquet", "t.npz"):
+        (tmp_path / name).touch()
+    for name in ("t", "d.parquet"):
+        (tmp_path / name).mkdir()
+    first = next(module for module in FORMATS if module.claims(path))
+    assert first.__name__ == f"erl_torch.experience.formats.{format}"
+    assert not any(module.claims("nowhere.parquet") for module in FORMATS)
+
+
+def test_a_format_of_ones_own(tmp_path):
+    csv = runpy.run_path(str(ROOT / "examples" / "own_format.py"))["Csv"]()
+    path = tmp_path / "t.csv"
+    rows = zip(*(getattr(NOISY, name).tolist() for name in COLUMNS), strict=True)
+    text = "s,a,r,s_next,a_next\n" + "".join(f"{s},{a},{r!r},{s_next},{a_next}\n" for s, a, r, s_next, a_next in rows)
+    path.write_text(text)
+    for chunk in (700, 1 << 20):
+        data = read_experience(path, 5, 3, chunk=chunk, format=csv)
+        assert isinstance(data, FileRecording) == (chunk == 700)
+        assert data.checksum() == NOISY.checksum()
+        same(LEARN["s1"].fit(data, 5, 3), LEARN["s1"].fit(NOISY, 5, 3))
+    path.write_text(text + "5,0,nan,0,0\n4,0,1.0,0,0\n")
+    with pytest.raises(InputError, match=re.escape(f"{path}: s[13000]=5: must be a whole number in [0, 5)")):
+        read_experience(path, 5, 3, format=csv)
+    data = read_experience(path, 5, 3, format=csv, on_bad="skip", chunk=700)
+    assert (len(data), data.n_skipped) == (13_001, 1)
+    path.write_text(text + "five\n")
+    with pytest.raises(InputError, match="must be a readable CSV file"):
+        read_experience(path, 5, 3, format=csv)
+    with pytest.raises(InputError, match=r"t\.txt: must be claimed by the given format"):
+        read_experience(tmp_path / "t.txt", 5, 3, format=csv)
+
+
+@pytest.mark.parametrize("change", [{"r": None}, {"r": np.ones(39)}, {"s": np.ones((40, 1), int)}])
+def test_what_a_format_reads_must_be_five_columns(change):
+    class Broken:
+        path, short = "t", 0
+
+        def claims(self, path):
+            return True
+
+        def reader(self, path, options):
+            return self
+
+        def batches(self, rows, strict):
+            yield {**vars(SHORT), **change}
+
+    with pytest.raises(InputError, match=r"^path=t=shapes .* from row 0 on: must be five columns of one length"):
+        read_experience("t", 5, 3, format=Broken())
+
+
 def test_a_failure_names_its_tuple_wherever_it_is_read_from():
     data = Transitions(PLAIN.s, PLAIN.a, PLAIN.r.copy(), PLAIN.s_next, PLAIN.a_next)
     data.r[7777:] -= 300.0
@@ -462,7 +525,7 @@ def test_minari_episodes_become_tuples(tmp_path, monkeypatch):
 def test_minari_boxes_are_binned():
     """Observations by the environment's own bins, actions by the nearest of its values."""
     env = Discretise(gym.make("Pendulum-v1"), 4, actions=5)  # -2, -1, 0, 1, 2
-    source = _Minari("minari:none", env, np.full((64, 5), 0.2), False, 0)
+    source = Minari("minari:none", Options(64, 5, env))
     actions = np.array([[1.2], [-1.6], [2.0], [0.4]], np.float32)
     assert source._actions(actions, env.env).tolist() == [3, 0, 4, 2]
     seen = np.array([[-0.9, 0.1, 7.0], [0.9, -0.6, -1.0]])

@@ -28,9 +28,9 @@ from numpy.typing import ArrayLike
 
 from erl_torch import checks
 from erl_torch.experience.play import Plan, tuples, vector_tuples
-from erl_torch.experience.recording import TYPES, FileRecording, read_experience, write_chunks
+from erl_torch.experience.recording import FileRecording, read_experience, write_chunks
 from erl_torch.experience.sampling import Sampler
-from erl_torch.experience.transitions import COLUMNS, Transitions, join
+from erl_torch.experience.transitions import COLUMNS, TYPES, Transitions, join
 from erl_torch.mdp.from_gymnasium import changed_by, known_mdp, sizes
 from erl_torch.mdp.tabular import TabularMDP, check_policy
 from erl_torch.rng import Streams, streams
@@ -157,8 +157,7 @@ def _stream(
         assert not isinstance(source, TabularMDP)
         batch = batched(source)
         if batch is not None:
-            policies = {"behaviour_policy": None if on_prior else behaviour, "prior_policy": prior}
-            chunks = iter([batch(n_episodes, episode_length, seed=rng, **policies)])
+            chunks = iter([batch(plan, None)])
         else:
             chunks = tuples(source, plan)
             chunks = _holding(chunks, plan) if destination == "memory" else chunks
@@ -193,8 +192,11 @@ def _fits(destination: str, plan: Plan, needed: int) -> None:
         checks.disk("n_episodes", plan.n_episodes, needed, what, destination)
 
 
-def batched(env: gym.Env[Any, Any]) -> Callable[..., Transitions] | None:
-    """What plays many episodes of ``env`` at once, if something can and it is not wrapped in something else."""
+def batched(env: gym.Env[Any, Any]) -> Callable[[Plan, str | None], Transitions] | None:
+    """The function (plan, reward) that plays all episodes of ``env`` at once; None where there is none.
+
+    ``reward`` is as in ``rollout``; None is that of ``env``. There is none for an ``env`` that a wrapper changes.
+    """
     base = env.unwrapped
     control = sys.modules.get("erl_torch.envs.control")  # which loads torch: there where there is such an environment
     if control is None or not isinstance(base, control.ControlEnv) or changed_by(env) is not None:
@@ -203,8 +205,10 @@ def batched(env: gym.Env[Any, Any]) -> Callable[..., Transitions] | None:
 
     longest = env.spec.max_episode_steps if env.spec else None
 
-    def collect_at_once(n_episodes: int, episode_length: int, **arguments: Any) -> Transitions:
-        return episodes_of(base, n_episodes, min(episode_length, longest or episode_length), **arguments)
+    def collect_at_once(plan: Plan, reward: str | None) -> Transitions:
+        return episodes_of(
+            base, plan._replace(episode_length=min(plan.episode_length, longest or plan.episode_length)), reward
+        )
 
     return collect_at_once
 

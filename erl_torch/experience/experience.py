@@ -48,7 +48,7 @@ class Experience(Protocol):
 
 
 class Parts(Generic[Part]):
-    """What ``make`` makes of each chunk: once where the stream is in memory, else anew in every pass."""
+    """What ``make`` makes of each chunk. It is kept where the stream is in memory, else made again in every pass."""
 
     def __init__(self, data: Experience, make: Callable[[Transitions], Part], multiple: int = 1) -> None:
         self._data, self._make, self._multiple = data, make, multiple
@@ -56,7 +56,7 @@ class Parts(Generic[Part]):
 
     @property
     def whole(self) -> Part:
-        """Of a stream in memory."""
+        """What was made of a stream in memory."""
         return self._whole[0]
 
     def __iter__(self) -> Iterator[Part]:
@@ -64,7 +64,7 @@ class Parts(Generic[Part]):
 
 
 class Selection:
-    """The tuples of an experience for which ``takes_part`` (chunk -> mask [n]) holds: ``n_tuples`` of them, above 0."""
+    """The tuples of ``data`` in the masks [n] of ``takes_part`` (chunk -> mask): ``n_tuples`` of them, >= 1."""
 
     def __init__(self, data: Experience, takes_part: Callable[[Transitions], np.ndarray], n_tuples: int) -> None:
         self._data, self._takes_part, self._n = data, takes_part, n_tuples
@@ -76,8 +76,8 @@ class Selection:
         self._data.check_range(n_states, n_actions)
 
     def chunks(self, multiple: int = 1) -> Iterator[Transitions]:
-        found = ((chunk, self._takes_part(chunk)) for chunk in self._data.chunks())
-        return regroup((chunk.where(mask) for chunk, mask in found if mask.any()), multiple)
+        masked = ((chunk, self._takes_part(chunk)) for chunk in self._data.chunks())
+        return regroup((chunk.where(mask) for chunk, mask in masked if mask.any()), multiple)
 
     def checksum(self) -> int:
         running = Checksum()

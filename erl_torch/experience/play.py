@@ -1,7 +1,7 @@
 """Environments taken through ``env.step``: to evaluate a policy, to show it, or to collect tuples.
 
-``episode`` steps one environment, whatever for; ``tuples`` makes a stream of what it yields. ``vector_tuples`` steps a
-vector of environments.
+``episode`` steps an environment, for each of these purposes; ``tuples`` makes a stream of its steps. ``vector_tuples``
+steps a vector of environments.
 """
 
 from __future__ import annotations

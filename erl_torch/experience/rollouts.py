@@ -1,21 +1,23 @@
 """Episodes of control tasks in their original, continuous dynamics, many at once.
 
 The action is a draw from policy(.|cell of the state). An episode ends where the original terminates, or after
-``max_steps``. Episodes advance together, one batched step of the dynamics at a time; each keeps its own column of
+``max_steps``. Episodes advance together, one batched step of the dynamics at a time; each has its own column of
 random numbers.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 
 from erl_torch import checks
 from erl_torch.envs.control import REWARDS, ControlEnv, ControlTask, control_task
 from erl_torch.envs.discretise import UniformBins
+from erl_torch.experience.play import Plan
 from erl_torch.experience.sampling import policy_cdf
 from erl_torch.experience.transitions import Transitions
 from erl_torch.mdp.tabular import check_policy
@@ -43,7 +45,7 @@ class _Tick(NamedTuple):
 
 def rollout(
     task: str | ControlTask,
-    policy: Any,
+    policy: ArrayLike,
     n_episodes: int,
     max_steps: int,
     rng: np.random.Generator,
@@ -82,8 +84,8 @@ def collect_rollouts(
     n_episodes: int,
     episode_length: int,
     seed: int | Streams = 0,
-    behaviour_policy: Any = None,
-    prior_policy: Any = None,
+    behaviour_policy: ArrayLike | None = None,
+    prior_policy: ArrayLike | None = None,
     bins: UniformBins | int | Sequence[int] | None = None,
     actions: tuple[float, ...] | None = None,
     reward: str = "cyclic",
@@ -177,9 +179,16 @@ def _table(policy: np.ndarray) -> np.ndarray:
     return policy_cdf(policy).reshape(policy.shape)
 
 
-def episodes_of(env: ControlEnv, n_episodes: int, episode_length: int, **arguments: Any) -> Transitions:
-    """Episodes of ``env``, all at once; arguments as in ``collect_rollouts``."""
-    settings: dict[str, Any] = {"bins": env.bins, "reward": env.reward} | arguments
-    if env.task.max_action is not None:
-        settings["actions"] = env.actions
-    return collect_rollouts(env.task, n_episodes, episode_length, **settings)
+def episodes_of(env: ControlEnv, plan: Plan, reward: str | None) -> Transitions:
+    """Episodes of ``env``, all at once; ``reward`` as in ``rollout``, None is the environment's own."""
+    return collect_rollouts(
+        env.task,
+        plan.n_episodes,
+        plan.episode_length,
+        plan.rng,
+        None if plan.on_prior else plan.behaviour,
+        plan.prior,
+        env.bins,
+        None if env.task.max_action is None else env.actions,
+        env.reward if reward is None else reward,
+    )

@@ -1,4 +1,4 @@
-"""Streams of tuples of a known MDP, sampled in compiled code: any number of them side by side, a lane each.
+"""Streams of tuples of a known MDP, sampled in compiled code: any number of them side by side, one lane per stream.
 
 A lane draws what NumPy's generators of its seed draw, in the same order, so that its stream does not depend on the
 lanes beside it or on how it is cut.
@@ -24,7 +24,7 @@ class Sampler:
     Args:
         mdp: what is sampled.
         rngs: the named streams of each lane; ``take`` leaves them as they are, ``give_back`` moves them on.
-        episode_length: steps an episode.
+        episode_length: steps per episode.
         behaviour, prior: [S, A]; with ``on_prior`` the action taken next is a'.
     """
 

@@ -1,12 +1,12 @@
-"""Experience of many replicas: one stream for all, one recorded stream each, or one simulated stream each."""
+"""Experience of many replicas: one stream for all of them, or one per replica, recorded or simulated."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from erl_torch import checks
 from erl_torch.experience.collect import collect
@@ -19,12 +19,12 @@ TUPLE_BYTES = 8  # a tuple in the interleaved loop
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """A stream of ``mdp`` for each seed: ``n_episodes`` of ``episode_length`` steps, a' from the learners' prior.
+    """One stream of ``mdp`` per seed: ``n_episodes`` of ``episode_length`` steps, a' from the learners' prior.
 
     Args:
         mdp: what is simulated; its sizes are those of the learners.
         n_episodes, episode_length: whole numbers >= 1; their product is the length of each stream.
-        seeds: whole numbers >= 0, one a replica.
+        seeds: whole numbers >= 0, one per replica.
         behaviour_policy: [S, A]; None is the prior.
         keep: hold the tuples in memory (true), sample them again in every pass (false), or what fits 1 GiB (None).
 
@@ -36,7 +36,7 @@ class Simulation:
     n_episodes: int
     episode_length: int
     seeds: Sequence[int]
-    behaviour_policy: Any = None
+    behaviour_policy: ArrayLike | None = None
     keep: bool | None = None
 
     def __post_init__(self) -> None:
@@ -57,7 +57,7 @@ class Simulation:
         """Of each stream."""
         return self.n_episodes * self.episode_length
 
-    def stream(self, replica: int, prior_policy: Any) -> Transitions:
+    def stream(self, replica: int, prior_policy: ArrayLike | None) -> Transitions:
         """The tuples of one replica."""
         seed = int(self.seeds[replica])
         return collect(self.mdp, self.n_episodes, self.episode_length, seed, self.behaviour_policy, prior_policy)

@@ -17,7 +17,8 @@ from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.experience.collect import collect, record
 from erl_torch.experience.experience import Experience
-from erl_torch.experience.recording import CHUNK, FileRecording, check_target, read_experience
+from erl_torch.experience.formats.npy import check_target
+from erl_torch.experience.recording import CHUNK, FileRecording, read_experience
 from erl_torch.experience.simulation import Simulation
 from erl_torch.files import read_npy
 from erl_torch.mdp.from_gymnasium import known_mdp

@@ -7,7 +7,6 @@ import zlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -16,6 +15,7 @@ from erl_torch.checks import InputError
 from erl_torch.files import read_npz, write_npz
 
 COLUMNS = ("s", "a", "r", "s_next", "a_next")
+TYPES = {name: np.dtype("<f8" if name == "r" else "<i4") for name in COLUMNS}  # in files
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,13 +56,13 @@ class Transitions:
         """The first ``n`` tuples."""
         return self.where(slice(n))
 
-    def where(self, rows: Any) -> Transitions:
+    def where(self, rows: slice | np.ndarray) -> Transitions:
         """The tuples of a slice or mask; at least one."""
         return Transitions.checked(*(getattr(self, name)[rows] for name in COLUMNS))
 
     @classmethod
     def checked(cls, *columns: np.ndarray) -> Transitions:
-        """Of columns that are known to be right, types and lengths included: nothing is looked at again."""
+        """Make them of columns that are known to be right, types and lengths included. Nothing is checked again."""
         if not len(columns[0]):
             raise InputError("transitions", "0 tuples", "at least one tuple")
         new = object.__new__(cls)
@@ -71,7 +71,7 @@ class Transitions:
         return new
 
     def chunks(self, multiple: int = 1) -> Iterator[Transitions]:
-        """Itself: the one chunk."""
+        """Yield itself, the one chunk."""
         yield self
 
     def checksum(self) -> int:
@@ -116,8 +116,8 @@ class Checksum:
 
     def of(self, chunk: Transitions) -> int:
         """The checksum of all chunks so far, this one included."""
-        for name, found in self.columns.items():
-            self.columns[name] = zlib.crc32(memoryview(getattr(chunk, name)), found)
+        for name, crc in self.columns.items():
+            self.columns[name] = zlib.crc32(memoryview(getattr(chunk, name)), crc)
         return zlib.crc32(np.array(list(self.columns.values()), "<u4").tobytes())
 
 
@@ -139,13 +139,13 @@ def regroup(chunks: Iterable[Transitions], multiple: int) -> Iterator[Transition
 
 
 def join(chunks: list[Transitions]) -> Transitions:
-    """Chunks as one."""
+    """The tuples of ``chunks``, in order, as one."""
     if len(chunks) == 1:
         return chunks[0]
     return Transitions.checked(*(np.concatenate([getattr(chunk, name) for chunk in chunks]) for name in COLUMNS))
 
 
-def _column(name: str, value: Any) -> np.ndarray:
+def _column(name: str, value: object) -> np.ndarray:
     column = checks.real(name, value)
     if column.ndim != 1:
         raise InputError(name, f"array of shape {column.shape}", "one-dimensional")

@@ -41,7 +41,7 @@ class Played(NamedTuple):
 
 
 def play(cfg: DictConfig) -> Played:
-    """Play as ``cfg`` (``conf/play.yaml``) says, and print what came of it.
+    """Play as ``cfg`` (``conf/play.yaml``) says, and print the figures of the episodes.
 
     Raises:
         InputError: a key or value that cannot be used, or a directory that is no run.
@@ -102,7 +102,7 @@ def play(cfg: DictConfig) -> Played:
 def episodes(
     env: gym.Env[Any, Any], policy: np.ndarray, n_episodes: int, horizon: int, seed: int, n_shown: int = 0
 ) -> Played:
-    """Play ``policy`` [S, A]: episodes of at most ``horizon`` steps, each with a random stream of its own.
+    """Play ``policy`` [S, A]: episodes of at most ``horizon`` steps, each with its own random stream.
 
     ``n_shown`` steps of the first episode are rendered, in the environment's render mode.
     """
@@ -131,10 +131,10 @@ def episodes(
 def find_run(name: str) -> Path:
     """The run directory of that name; ``latest`` is the newest below ``runs/``. Raises InputError."""
     if name == "latest":
-        found = [path for table in TABLES for path in RUNS.rglob(table)]
-        if not found:
+        saved = [path for table in TABLES for path in RUNS.rglob(table)]
+        if not saved:
             raise InputError("run", name, f"a run directory: there is no run below {RUNS}/")
-        return max(found, key=lambda path: path.stat().st_mtime_ns).parent
+        return max(saved, key=lambda path: path.stat().st_mtime_ns).parent
     directory = Path(name)
     if not any((directory / table).is_file() for table in TABLES):
         raise InputError("run", name, f"a run directory of train.py, with {' or '.join(TABLES)}")
@@ -142,7 +142,7 @@ def find_run(name: str) -> Path:
 
 
 def run_settings(run: Path) -> DictConfig:
-    """The configuration of ``run``, its environment with its own rewards. Raises InputError."""
+    """The configuration of ``run``, with the rewards that its environment itself pays. Raises InputError."""
     path = run / ".hydra" / "config.yaml"
     try:
         cfg: Any = OmegaConf.load(path)
@@ -164,15 +164,15 @@ def run_settings(run: Path) -> DictConfig:
 
 
 def run_policy(run: Path, replica: int | None) -> np.ndarray:
-    """The policy [S, A] that ``run`` learnt, or its replica's. Raises InputError."""
+    """The policy [S, A] that ``run`` learnt, or that one replica of it learnt. Raises InputError."""
     if (run / "solution.npz").is_file():
         if replica is not None:
             raise InputError("replica", replica, f"left out: {run} holds one policy")
         return np.asarray(Solution.load(run / "solution.npz").policy)
-    found = ReplicaSolution.load(run / "replicas.npz")
-    if not 0 <= (replica or 0) < len(found):
-        raise InputError("replica", replica, f"a whole number in [0, {len(found)})")
-    return np.asarray(found[replica or 0].policy)
+    replicas = ReplicaSolution.load(run / "replicas.npz")
+    if not 0 <= (replica or 0) < len(replicas):
+        raise InputError("replica", replica, f"a whole number in [0, {len(replicas)})")
+    return np.asarray(replicas[replica or 0].policy)
 
 
 def _report(head: str, played: Played) -> str:
