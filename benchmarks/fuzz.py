@@ -279,7 +279,12 @@ def every_key(base: Path) -> Iterator[tuple[str, list[str], str]]:
         for key in found:
             name = f"{cfg.learner.name}:{key}" if key.startswith("learner") else key
             name = f"{cfg.env.name}:{key}" if key.startswith("env") else name
-            if (name in seen and "n_replicas" not in choice[0]) or key.split(".")[-1] in ("class", "name", "id", "save_to"):
+            if (name in seen and "n_replicas" not in choice[0]) or key.split(".")[-1] in (
+                "class",
+                "name",
+                "id",
+                "save_to",
+            ):
                 continue
             seen.add(name)
             yield "train", cheap, key

@@ -50,8 +50,8 @@ if __name__ == "__main__":
     memory, file = (erl_torch.CertaintyEquivalence(beta=10.0).fit(one, 15, 4).theta for one in (data, read))
     print(f"theta       {memory:.6f} from memory, {file:.6f} from the file")
 
-    with open("tuples.csv", "a") as file:
-        file.write("99,0,-1,0,0\n")
+    with open("tuples.csv", "a") as opened:
+        opened.write("99,0,-1,0,0\n")
     try:
         erl_torch.read_experience("tuples.csv", 15, 4, format=Csv())
     except erl_torch.InputError as error:

@@ -9,6 +9,7 @@ import runpy
 import warnings
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -273,7 +274,7 @@ def test_the_first_format_that_claims_a_path_reads_it(tmp_path, monkeypatch, pat
         (tmp_path / name).touch()
     for name in ("t", "d.parquet"):
         (tmp_path / name).mkdir()
-    first = next(module for module in FORMATS if module.claims(path))
+    first: Any = next(module for module in FORMATS if module.claims(path))
     assert first.__name__ == f"erl_torch.experience.formats.{format}"
     assert not any(module.claims("nowhere.parquet") for module in FORMATS)
 

@@ -53,7 +53,7 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
 
 def _code(path: str) -> str:
     """A Python file of the tree, in full."""
-    return f"```python title=\"{Path(path).name}\"\n{(ROOT / path).read_text()}```"
+    return f'```python title="{Path(path).name}"\n{(ROOT / path).read_text()}```'
 
 
 def on_page_content(html_text: str, **_: Any) -> str:

@@ -1,7 +1,7 @@
 """Sums of rows, with an error that does not grow with their length.
 
 Kernels, here and in the other rooms, take plain C-contiguous arrays and scalars, use no globals, and validate nothing:
-the callers do. ``error_model="numpy"``: a division by zero gives inf or nan, which the caller checks, and no check costs
+the callers do. ``error_model="numpy"``: a division by zero gives inf or nan, which the caller checks; no check costs
 time. Kernels that call each other stand in one file, because Numba's cache does not notice a changed kernel in another
 file. Pair index: ``k = s * n_actions + a``. Transition matrices come as CSR arrays (indptr, indices, data).
 """
