@@ -107,6 +107,6 @@ def _typed(key: str, value: object, annotation: object) -> Any:
     if value is None and "None" in types:
         return None
     try:
-        return NODES[kind](value, is_optional=False)._value()  # type: ignore[abstract]
+        return NODES[kind](value, is_optional=False)._value()
     except ValidationError as error:
         raise InputError(key, value, KINDS[kind] + ", or null" * ("None" in types)) from error
