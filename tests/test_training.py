@@ -233,7 +233,7 @@ def learning(cwd):
     """Whether the run below ``cwd`` has written what an epoch made."""
     paths = list(cwd.rglob("events.*"))
     reader = events(paths[0]) if paths else None
-    return reader and "s1/theta" in reader.Tags()["scalars"] and reader.Scalars("s1/theta")[-1].step > 0
+    return reader and "learner/theta" in reader.Tags()["scalars"] and reader.Scalars("learner/theta")[-1].step > 0
 
 
 def signalled(cwd, send):
