@@ -1460,7 +1460,7 @@ MUTANTS = [
         "traps stand beside the start",
         "envs/mazes.py",
         "kept[row - 1 : row + 2, col - 1 : col + 2] = True",
-        "near[row - 1 : row + 2, col - 1 : col + 1] = True",
+        "kept[row - 1 : row + 2, col - 1 : col + 1] = True",
         "test_mazes.py",
     ),
     Mutant(

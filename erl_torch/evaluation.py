@@ -17,7 +17,7 @@ from erl_torch.experience import kernels as experience_kernels
 from erl_torch.experience.collect import batched
 from erl_torch.experience.play import Plan, draw_action, episode, reset
 from erl_torch.experience.sampling import policy_cdf, sampling_tables
-from erl_torch.mdp.from_gymnasium import known_mdp, sizes
+from erl_torch.mdp.from_gymnasium import ending_states, known_mdp, sizes
 from erl_torch.mdp.tabular import TabularMDP, check_policy, check_prior
 from erl_torch.rng import Streams
 from erl_torch.solvers import kernels as solvers_kernels
@@ -76,7 +76,7 @@ def evaluate(
     prior = check_prior("prior_policy", prior_policy, n_states, n_actions)
     own_mdp = known_mdp(source)
     model = own_mdp if mdp is None else mdp
-    endless = isinstance(source, TabularMDP) or not getattr(source.unwrapped, "ends", np.zeros(1)).any()
+    endless = isinstance(source, TabularMDP) or not ending_states(source, n_states).any()
     if model is not None and mean_return is not None:
         played = mean_return(table)
     elif own_mdp is not None and endless:

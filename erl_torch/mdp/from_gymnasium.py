@@ -87,6 +87,11 @@ def ending_states(env: gym.Env[Any, Any], n_states: int) -> np.ndarray:
     return np.asarray(getattr(env.unwrapped, "ends", np.zeros(n_states, bool)))
 
 
+def has_table(env: gym.Env[Any, Any]) -> bool:
+    """Whether the environment tells its model as ``P``."""
+    return hasattr(env.unwrapped, "P")
+
+
 def _table(env: gym.Env[Any, Any]) -> Table:
     """``P``, as it is. Raises InputError where there is none, or where it leaves out part of the process (Taxi)."""
     base = env.unwrapped

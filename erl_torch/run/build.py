@@ -25,7 +25,7 @@ from erl_torch.experience.sources import Source
 from erl_torch.experience.transitions import Transitions, join
 from erl_torch.files import read_npy
 from erl_torch.learners.learner import Learner
-from erl_torch.mdp.from_gymnasium import MeanRewardWarning, absorbing, known_mdp, sizes, tabular_mdp
+from erl_torch.mdp.from_gymnasium import MeanRewardWarning, absorbing, has_table, known_mdp, sizes, tabular_mdp
 from erl_torch.mdp.tabular import TabularMDP, check_policy
 from erl_torch.notes import note
 from erl_torch.problem import Problem
@@ -114,7 +114,7 @@ def make_world(cfg: DictConfig, env: gym.Env[Any, Any], safe_point: SafePoint) -
         return _control_world(cfg, env, safe_point)
     on_end = cfg.get("on_end", "restart")
     checks.one_of("env.on_end", on_end, ("restart", "absorb"))
-    if known_mdp(env) is not None or not cfg.get("use_model") or not hasattr(env.unwrapped, "P"):
+    if known_mdp(env) is not None or not cfg.get("use_model") or not has_table(env):
         if on_end == "absorb":
             raise InputError("env.on_end", on_end, "restart, where there is no model (P) to read")
         return World(env, known_mdp(env))
