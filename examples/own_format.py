@@ -47,8 +47,8 @@ if __name__ == "__main__":
 
     read = erl_torch.read_experience("tuples.csv", 15, 4, chunk=1000, format=Csv())  # 1,000 tuples at a time
     print(f"tuples      {len(read):,}, the same: {read.checksum() == data.checksum()}")
-    memory, file = (erl_torch.CertaintyEquivalence(beta=10.0).fit(one, 15, 4).theta for one in (data, read))
-    print(f"theta       {memory:.6f} from memory, {file:.6f} from the file")
+    memory, disk = (erl_torch.CertaintyEquivalence(beta=10.0).fit(one, 15, 4).theta for one in (data, read))
+    print(f"theta       {memory:.6f} from memory, {disk:.6f} from the file")
 
     with open("tuples.csv", "a") as opened:
         opened.write("99,0,-1,0,0\n")

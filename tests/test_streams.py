@@ -1,6 +1,7 @@
 """Streams of any size: the same bits however they are cut and wherever they are read from; damage is named."""
 
 import contextlib
+import importlib
 import io
 import json
 import os
@@ -9,7 +10,6 @@ import runpy
 import warnings
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -274,8 +274,8 @@ def test_the_first_format_that_claims_a_path_reads_it(tmp_path, monkeypatch, pat
         (tmp_path / name).touch()
     for name in ("t", "d.parquet"):
         (tmp_path / name).mkdir()
-    first: Any = next(module for module in FORMATS if module.claims(path))
-    assert first.__name__ == f"erl_torch.experience.formats.{format}"
+    first = next(module for module in FORMATS if module.claims(path))
+    assert first is importlib.import_module(f"erl_torch.experience.formats.{format}")
     assert not any(module.claims("nowhere.parquet") for module in FORMATS)
 
 
