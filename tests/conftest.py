@@ -2,6 +2,7 @@
 
 import os
 import runpy
+import signal
 import sys
 from pathlib import Path
 
@@ -12,6 +13,7 @@ if worker := os.environ.get("PYTEST_XDIST_WORKER"):
     os.environ["NUMBA_CACHE_DIR"] = os.path.join(caches, worker)
 
 import hypothesis
+import numba
 import numpy as np
 import pytest
 from helpers import DATA, ROOT, processes
@@ -34,6 +36,24 @@ def pytest_collection_modifyitems(items):
             item.add_marker("command")
         elif item.get_closest_marker("slow") is None:
             item.add_marker("fast")
+
+
+if numba.config.DISABLE_JIT:
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_call(item):
+        """Skip what takes longer than five seconds without the compiler, so that measuring coverage ends."""
+
+        def skip(number, frame):
+            pytest.skip("too long without the compiler")
+
+        before = signal.signal(signal.SIGALRM, skip)
+        signal.setitimer(signal.ITIMER_REAL, 5.0)
+        try:
+            return (yield)
+        finally:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+            signal.signal(signal.SIGALRM, before)
 
 
 @pytest.fixture

@@ -367,13 +367,13 @@ def test_interval(tmp_path, monkeypatch):
     saved = Checkpoints(tmp_path, {}, 10.0)
     for step, at in enumerate((9.9, 10.0, 15.0, 20.1)):
         now[0] = at
-        saved.offer(step, lambda: {})
+        saved.offer(step, dict)
     assert sorted(p.name for p in (tmp_path / "checkpoints").iterdir()) == [f"{i:018d}.ckpt" for i in (1, 3)]
     never = Checkpoints(tmp_path / "never", {}, None)
     now[0] = 1e9
-    never.offer(1, lambda: {})
+    never.offer(1, dict)
     assert not (tmp_path / "never").exists()
-    never.offer(1, lambda: {}, now=True)
+    never.offer(1, dict, now=True)
     assert len(list((tmp_path / "never/checkpoints").iterdir())) == 1
 
 

@@ -233,9 +233,7 @@ def test_solutions_with_a_wrong_field_are_refused(cliff, tmp_path, field):
         np.savez(tmp_path / f"{i}.npz", **arrays | {field: value})
         with contextlib.suppress(InputError):
             Solution.load(tmp_path / f"{i}.npz")
-    np.savez(
-        tmp_path / "r.npz", **{"policy": np.zeros((2, 3, 1)), "psi": np.zeros(3), "status": np.array(["STOPPED"] * 2)}
-    )
+    np.savez(tmp_path / "r.npz", policy=np.zeros((2, 3, 1)), psi=np.zeros(3), status=np.array(["STOPPED"] * 2))
     with pytest.raises(InputError, match="as many rows in every array"):
         ReplicaSolution.load(tmp_path / "r.npz")
 
