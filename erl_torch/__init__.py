@@ -32,7 +32,7 @@ _PUBLIC = {
     "mdp.from_gymnasium": "MeanRewardWarning tabular_mdp",
     "mdp.tabular": "TabularMDP",
     "notes": "Note",
-    "problem": "Policy Problem",
+    "problem": "Problem",
     "run.judge": "EvaluationSettings",
     "run.session": "train",
     "solution": "Solution Status",

@@ -35,7 +35,6 @@ from erl_torch.mdp.from_gymnasium import MeanRewardWarning as MeanRewardWarning
 from erl_torch.mdp.from_gymnasium import tabular_mdp as tabular_mdp
 from erl_torch.mdp.tabular import TabularMDP as TabularMDP
 from erl_torch.notes import Note as Note
-from erl_torch.problem import Policy as Policy
 from erl_torch.problem import Problem as Problem
 from erl_torch.run.judge import EvaluationSettings as EvaluationSettings
 from erl_torch.run.session import train as train
