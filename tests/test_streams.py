@@ -265,17 +265,17 @@ def test_refusals(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("path", "format"),
+    ("path", "module_name"),
     [("minari:t.parquet", "minari"), ("t.parquet", "parquet"), ("t.npz", "npy"), ("t", "npy"), ("d.parquet", "npy")],
 )
-def test_the_first_format_that_claims_a_path_reads_it(tmp_path, monkeypatch, path, format):
+def test_the_first_format_that_claims_a_path_reads_it(tmp_path, monkeypatch, path, module_name):
     monkeypatch.chdir(tmp_path)
     for name in ("t.parquet", "t.npz"):
         (tmp_path / name).touch()
     for name in ("t", "d.parquet"):
         (tmp_path / name).mkdir()
     first = next(module for module in FORMATS if module.claims(path))
-    assert first is importlib.import_module(f"erl_torch.experience.formats.{format}")
+    assert first is importlib.import_module(f"erl_torch.experience.formats.{module_name}")
     assert not any(module.claims("nowhere.parquet") for module in FORMATS)
 
 

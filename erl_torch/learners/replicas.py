@@ -34,7 +34,7 @@ from erl_torch.checks import InputError
 from erl_torch.experience.simulation import ReplicaExperience, Simulation, fits, streams_of, tuples_of
 from erl_torch.experience.transitions import Transitions
 from erl_torch.files import read_npz, write_npz
-from erl_torch.learners.learner import NonFiniteError, StreamLearner, columns
+from erl_torch.learners.learner import NonFiniteError, StreamLearner, StreamState, columns
 from erl_torch.learners.s1.algorithm import AlgorithmS1
 from erl_torch.learners.s1.lanes import LanesState, can_interleave, interleave
 from erl_torch.learners.together import Together, check_learner
@@ -62,7 +62,7 @@ class ReplicaState(Protocol):
     def policy(self) -> torch.Tensor:
         """[R, S, A]."""
 
-    def replica(self, r: int) -> Any:
+    def replica(self, r: int) -> StreamState:
         """The state of one replica, as its own learner would have it."""
 
     def milestone(self, learners: Sequence[StreamLearner[Any, Any]]) -> str:
@@ -145,7 +145,7 @@ class Replicas(Together):
     @classmethod
     def of(
         cls,
-        learner: Any,
+        learner: Any,  # a StreamLearner that is a dataclass: no type says both
         n_replicas: int | None = None,
         *,
         threads: int | None = None,
@@ -276,7 +276,7 @@ def _number(value: Any) -> Any:
 class EachState:
     """States of learners that run beside each other."""
 
-    states: tuple[Any, ...]
+    states: tuple[StreamState, ...]
     failures: Mapping[int, NonFiniteError]
     stepped: tuple[int, ...] = ()  # the replicas that this epoch was of
 
@@ -292,7 +292,7 @@ class EachState:
     def policy(self) -> torch.Tensor:
         return torch.stack([state.policy for state in self.states])
 
-    def replica(self, r: int) -> Any:
+    def replica(self, r: int) -> StreamState:
         return self.states[r]
 
     def milestone(self, learners: Sequence[StreamLearner[Any, Any]]) -> str:

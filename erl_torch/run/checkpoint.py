@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from enum import Enum
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -172,7 +173,7 @@ def rows_of(found: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
 # -- values and their files -----------------------------------------------------------------------------
 
 
-def encode(value: Any) -> Any:
+def encode(value: object) -> object:
     """``value`` in containers, numbers, text and tensors; dataclasses and errors by the name of their class."""
     if isinstance(value, np.ndarray):
         return {"class": "array", "value": torch.from_numpy(np.ascontiguousarray(value))}
@@ -195,11 +196,11 @@ def encode(value: Any) -> Any:
     return value.detach().cpu() if isinstance(value, torch.Tensor) else value
 
 
-def decode(value: Any, classes: Iterable[type], device: str = "cpu") -> Any:
+def decode(value: object, classes: Iterable[type], device: str = "cpu") -> Any:
     """What ``encode`` was given. Raises ValueError for a class that is not one of ``classes``."""
     by_name: dict[str, Any] = {one.__name__: one for one in classes}
 
-    def decoded(value: Any) -> Any:
+    def decoded(value: Any) -> Any:  # what torch.load gave: anything
         if isinstance(value, list):
             return [decoded(item) for item in value]
         if isinstance(value, torch.Tensor):
@@ -224,7 +225,7 @@ def decode(value: Any, classes: Iterable[type], device: str = "cpu") -> Any:
     return decoded(value)
 
 
-def _write(path: Path, settings: Mapping[str, Any], content: Any) -> None:
+def _write(path: Path, settings: Mapping[str, Any], content: object) -> None:
     buffer = io.BytesIO()
     torch.save({"format": FORMAT, "settings": dict(settings), "content": encode(content)}, buffer)
     body = buffer.getvalue()
@@ -257,7 +258,7 @@ def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return found
 
 
-def _json(value: Any) -> Any:
+def _json(value: object) -> object:
     """``value`` as JSON gives it back; it has no infinities."""
     if isinstance(value, Mapping):
         return {str(key): _json(item) for key, item in value.items()}
@@ -280,7 +281,9 @@ class Ended:
     def __enter__(self) -> Ended:
         return self
 
-    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> bool:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> bool:
         if not isinstance(error, Exception) or not self.learnt():
             return False
         self.error = error

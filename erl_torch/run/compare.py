@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 import scipy.stats
 import torch
+from numpy.typing import ArrayLike
 from omegaconf import DictConfig
 from tqdm import tqdm
 
@@ -36,6 +37,7 @@ from erl_torch.checks import InputError
 from erl_torch.experience.collect import collect
 from erl_torch.experience.sources import Simulate
 from erl_torch.files import read_npy, write_json, write_png
+from erl_torch.learners.learner import StreamLearner
 from erl_torch.learners.s1 import kernels
 from erl_torch.mdp.tabular import TabularMDP, check_policy
 from erl_torch.notes import collected
@@ -117,8 +119,8 @@ def compare(
     n_episodes: int = 500,
     episode_length: int = 1000,
     seeds: int | Sequence[int] = 20,
-    behaviour_policy: Any = None,
-    prior_policy: Any = None,
+    behaviour_policy: ArrayLike | None = None,
+    prior_policy: ArrayLike | None = None,
     n_sizes: int = 1,
     processes: int = 1,
     report: Callable[[int, int], object] = lambda done, total: None,
@@ -197,10 +199,10 @@ def _sizes(n_tuples: int, n_sizes: int) -> tuple[int, ...]:
 
 
 def _run(
-    learner: Any,
+    learner: StreamLearner[Any, Any],
     experience: tuple[TabularMDP, int, int],
     seed: int,
-    behaviour_policy: Any,
+    behaviour_policy: ArrayLike | None,
     prior: np.ndarray,
     sizes: tuple[int, ...],
     best: Optimum,
@@ -255,7 +257,7 @@ def _statistics(values: np.ndarray) -> dict[str, Any]:
     }
 
 
-def _nullable(values: Any) -> Any:
+def _nullable(values: float | list[Any]) -> float | list[Any] | None:
     if isinstance(values, list):
         return [_nullable(value) for value in values]
     return values if np.isfinite(values) else None

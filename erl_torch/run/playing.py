@@ -55,19 +55,7 @@ def play(cfg: DictConfig) -> Played:
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # pygame draws without a display
     run = find_run(cfg.run)
     settings = run_settings(run)
-    kind = settings.env.get("class")
-    named = cfg.env["class"]
-    if named is not None and named != kind:
-        raise InputError("env.class", named, f"left out: the environment of {run} is of another class")
-    if kind is not None and not is_own(kind) and named is None:
-        allowed = f"typed as env.class={kind}: it makes the run's environment, and is imported only if you name it"
-        raise InputError("env.class", named, allowed)
-    module, colon, _ = str(settings.env.get("id")).partition(":")
-    if cfg.module != (module if colon else None):
-        if colon:
-            allowed = f"typed as module={module}: it makes the run's environment, and runs only if you name it"
-            raise InputError("module", cfg.module, allowed)
-        raise InputError("module", cfg.module, f"left out: no module makes the environment of {run}")
+    _check_named(cfg, settings, run)
     table = run_policy(run, cfg.replica)
     mode = MODES.get(cfg.render)
     with contextlib.closing(make_env(settings.env)) as plain:
@@ -97,6 +85,23 @@ def play(cfg: DictConfig) -> Played:
         path = write_gif(run / f"episode{which}-seed-{cfg.seed}.gif", played.shown, fps)
         print(f"{'picture':18}{path}")
     return played
+
+
+def _check_named(cfg: DictConfig, settings: DictConfig, run: Path) -> None:
+    """Whatever is imported to make the environment of ``run`` must be named in ``cfg``. Raises InputError."""
+    kind = settings.env.get("class")
+    named = cfg.env["class"]
+    if named is not None and named != kind:
+        raise InputError("env.class", named, f"left out: the environment of {run} is of another class")
+    if kind is not None and not is_own(kind) and named is None:
+        allowed = f"typed as env.class={kind}: it makes the run's environment, and is imported only if you name it"
+        raise InputError("env.class", named, allowed)
+    module, colon, _ = str(settings.env.get("id")).partition(":")
+    if cfg.module != (module if colon else None):
+        if colon:
+            allowed = f"typed as module={module}: it makes the run's environment, and runs only if you name it"
+            raise InputError("module", cfg.module, allowed)
+        raise InputError("module", cfg.module, f"left out: no module makes the environment of {run}")
 
 
 def episodes(

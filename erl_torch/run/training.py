@@ -23,6 +23,7 @@ from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.experience.experience import Experience
 from erl_torch.experience.simulation import ReplicaExperience, Simulation, streams_of
+from erl_torch.learners.learner import TabularLearner
 from erl_torch.learners.replicas import Replicas
 from erl_torch.learners.s1 import kernels
 from erl_torch.log.tensorboard import hyperparameters
@@ -134,7 +135,7 @@ def _common(
 
 def _single(
     cfg: DictConfig,
-    learner: Any,
+    learner: TabularLearner[Any],
     problem: Problem,
     settings: EvaluationSettings,
     saved: Checkpoints,
@@ -198,7 +199,7 @@ def _replicas(
     )
 
 
-def _with(learner: Any, group: Group) -> Any:
+def _with(learner: Any, group: Group) -> Any:  # a dataclass of the user's choice
     try:
         return replace(learner, **group.settings)
     except InputError as error:

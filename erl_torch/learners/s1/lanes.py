@@ -41,6 +41,8 @@ COMMON = (
     "implementation",
     "device",
 )  # arguments that interleaved learners share
+Array = np.ndarray
+Rates = tuple[Array, Array, Array]  # lr_u, lr_rho, smallest 1/rho, [lanes] each
 LANES = 32  # a block, while its tables fit the cache beside the core
 SMALL_TABLES = 1 << 17  # entries of z of a block that do
 ROWS = 256  # sampled at a time
@@ -356,7 +358,7 @@ class Engine:
             return self._torch_block(part, lambda i, j: (pair[i:j], pair_next[i:j]), r)
         side_by_side = self._side_by_side(part)
 
-        def run(begin: int, end: int, g: Any, z: Any, q: Any, rates: Any, failed: Any) -> None:
+        def run(begin: int, end: int, g: Array, z: Array, q: Array, rates: Rates, failed: Array) -> None:
             for first, stop, factor in self._factors(part, r, begin, end):
                 kernels.lanes_epoch(
                     pair[first:stop], pair_next[first:stop], factor, r is not None, g, z, q, *rates, self._new,
@@ -371,7 +373,7 @@ class Engine:
         if self._on_torch:
             return self._torch_block(part, lambda i, j: (stream.pair[i:j, None], stream.pair_next[i:j, None]), r)
 
-        def run(begin: int, end: int, g: Any, z: Any, q: Any, rates: Any, failed: Any) -> None:
+        def run(begin: int, end: int, g: Array, z: Array, q: Array, rates: Rates, failed: Array) -> None:
             for first, stop, factor in self._factors(part, r, begin, end):
                 kernels.shared_epoch(
                     stream.pair[first:stop], stream.pair_next[first:stop], factor, r is not None, g, z, q, *rates,
@@ -392,7 +394,7 @@ class Engine:
             pair, _, pair_next = source[0].take(stop - first)
             return pair, pair_next
 
-        def run(begin: int, end: int, g: Any, z: Any, q: Any, rates: Any, failed: Any) -> None:
+        def run(begin: int, end: int, g: Array, z: Array, q: Array, rates: Rates, failed: Array) -> None:
             s = sampler()
             kernels.sampled_epoch(
                 s.tables, s.environment, s.behaviour, s.now, buffers, g, z, q, *rates, self._new,
@@ -410,7 +412,7 @@ class Engine:
             factor = None if r is None else np.exp(self.beta[part] * r[first:stop])
             return *pairs(first, stop), factor
 
-        def run(begin: int, end: int, g: Any, z: Any, q: Any, rates: Any, failed: Any) -> None:
+        def run(begin: int, end: int, g: Array, z: Array, q: Array, rates: Rates, failed: Array) -> None:
             device = self.learner.device
             s1_torch.u_phase(rows, begin, end, g, z, q, rates, self._new, self._rescale, failed, device)
 

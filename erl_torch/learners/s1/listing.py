@@ -13,8 +13,12 @@ import numpy as np
 
 from erl_torch.experience.transitions import Transitions
 
+Table = Any  # torch.Tensor or np.ndarray: arithmetic of items of either has no type that mypy can say
 
-def psi_epoch(data: Transitions, psi: Any, log_psi: Any, mean_psi: Any, mean_log_psi: Any, lr_psi: float) -> None:
+
+def psi_epoch(
+    data: Transitions, psi: Table, log_psi: Table, mean_psi: Table, mean_log_psi: Table, lr_psi: float
+) -> None:
     """Lines 2-3 over the whole stream; mean_psi and mean_log_psi [S, A] change in place."""
     for s, a, s_next in zip(data.s.tolist(), data.a.tolist(), data.s_next.tolist(), strict=True):
         mean_psi[s, a] = (1 - lr_psi) * mean_psi[s, a] + lr_psi * psi[s_next]  # line 2
@@ -23,11 +27,11 @@ def psi_epoch(data: Transitions, psi: Any, log_psi: Any, mean_psi: Any, mean_log
 
 def u_epoch(
     data: Transitions,
-    psi: Any,
-    mean_psi: Any,
-    reward_bias: Any,
+    psi: Table,
+    mean_psi: Table,
+    reward_bias: Table,
     reward_bias_max: float,
-    u: Any,
+    u: Table,
     rho: float,
     *,
     beta: float,
@@ -63,22 +67,22 @@ def u_epoch(
 
 def efficient_epoch(
     data: Transitions,
-    psi: Any,
-    mean_psi: Any,
-    reward_bias: Any,
+    psi: Table,
+    mean_psi: Table,
+    reward_bias: Table,
     reward_bias_max: float,
-    u: Any,
+    u: Table,
     rho: float,
     *,
     beta: float,
-    steps: Any,
-    visits: Any,
+    steps: Table,
+    visits: Table,
     lr_rho: float,
     rho_max: float,
-    weight: Any,
+    weight: Table,
     expected: bool,
-    reward: Any = None,
-    total: Any = None,
+    reward: Table = None,
+    total: Table = None,
 ) -> float:
     """Lines 9-11 with EfficientS1's options; u, visits and total (sum of psi u over visits) change in place.
 
@@ -103,15 +107,15 @@ def efficient_epoch(
 
 def online_phase(
     data: Transitions,
-    value: Any,
-    sums: Any,
-    z: Any,
-    weight: Any,
+    value: Table,
+    sums: Table,
+    z: Table,
+    weight: Table,
     rho: float,
     *,
     beta: float,
-    prior: Any,
-    steps: Any,
+    prior: Table,
+    steps: Table,
     lr_rho: float,
     rho_max: float,
 ) -> tuple[float, float]:
