@@ -48,7 +48,7 @@ _RENAMED = {
     "save_columns": Renamed("experience.recording", "write_experience", "erl_torch.write_experience"),
 }
 
-__all__ = sorted(_HOME)  # noqa: PLE0605 (one table of names)
+__all__ = sorted(_HOME)
 
 __getattr__ = loader(__name__, _HOME, _RENAMED)
 

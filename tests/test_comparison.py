@@ -231,8 +231,8 @@ def test_every_learner_can_be_compared():
 @pytest.mark.parametrize(
     ("overrides", "expected"),
     [
-        (["learners=[s1,sarse]"], "learners=sarse: must be s1 or "),
-        (["learners=[exact]"], "learners=exact: must be s1 or "),
+        (["learners=[s1,sarse]"], "learners=sarse: must be certainty_equivalence or "),
+        (["learners=[exact]"], "learners=exact: must be certainty_equivalence or "),
         (["learners=[]"], "learners=[]: must be at least one"),
         (["seeds=0"], "seeds=0: must be a whole number >= 1"),
         (["beta=-1"], "learner.s1.beta=-1.0: must be a finite number > 0"),

@@ -9,14 +9,13 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import hydra
 from omegaconf import DictConfig
 
-import erl_torch
+from erl_torch import configurations
 from erl_torch.cli import main as cli
 from erl_torch.reproduction import ARTIFACTS
 
@@ -56,13 +55,7 @@ Stopped or killed, the same command goes on where it was. Files: runs/reproduce/
 """
 
 
-def _conf() -> Path:
-    """The configuration: of the tree that the package stands in, else as installed."""
-    beside = Path(erl_torch.__file__).resolve().parents[1] / "conf"
-    return beside if (beside / "train.yaml").exists() else Path(str(files("erl_torch.conf")))
-
-
-CONF = _conf()
+CONF = configurations.folder()
 
 
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="train")

@@ -12,8 +12,10 @@ from hydra._internal.utils import get_args_parser
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 
+from erl_torch import configurations
 from erl_torch.run.settings import Compare, Play, Reproduce, Standard, Suggest, Train
 
+NOT_COMPARED = ("exact",)  # it solves the model, and learns from no stream
 COMMANDS = {"train": Train, "compare": Compare, "reproduce": Reproduce, "play": Play}
 
 
@@ -37,6 +39,8 @@ def register() -> None:
         store.store(group="schema", name=name, node=schema)
     store.store(group="schema", name="suggest", node=Suggest)
     store.store(group="schema/evaluation", name="standard", node=Standard)
+    compared = [name for name in configurations.names("learner") if name not in NOT_COMPARED]
+    store.store(name="every_learner", node={"defaults": [{f"learner@learner.{name}": name} for name in compared]})
     OmegaConf.register_new_resolver("slug", slug, replace=True)
     OmegaConf.register_new_resolver("run_name", run_name, replace=True)
 

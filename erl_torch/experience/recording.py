@@ -71,7 +71,7 @@ class FileRecording:
         on_prior: bool = False,
         seed: int = 0,
         report: Callable[[int], object] | None = None,
-        format: Format | None = None,  # noqa: A002 (the word for it)
+        format: Format | None = None,
     ) -> None:
         checks.one_of("on_bad", on_bad, ("stop", "skip"))
         chunk = checks.at_least("chunk", chunk, 1)
@@ -196,7 +196,7 @@ def read_experience(
     on_prior: bool = False,
     seed: int = 0,
     report: Callable[[int], object] | None = None,
-    format: Format | None = None,  # noqa: A002
+    format: Format | None = None,
 ) -> Transitions | FileRecording:
     """Read the experience at ``path``: into memory where it is no longer than ``chunk``, else in every pass anew.
 

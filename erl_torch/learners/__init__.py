@@ -6,8 +6,13 @@ What a learner asks of its stream it declares: ``averages_exp_reward`` (noise in
 ``Exact`` solves a model instead: ``solve(mdp)``, ``iterate(mdp)``.
 """
 
-from typing import Any
+import functools
+import importlib
+from typing import TYPE_CHECKING, Any
 
+import yaml
+
+from erl_torch import configurations
 from erl_torch.learners.action_value.q_learning import (
     ActionValueState,
     DifferentialSoftQ,
@@ -18,50 +23,11 @@ from erl_torch.learners.action_value.q_learning import (
     ULearning,
 )
 from erl_torch.learners.action_value.z_learning import ZLearning
-from erl_torch.learners.certainty_equivalence import CertaintyEquivalence, CertaintyEquivalenceState
+from erl_torch.learners.certainty_equivalence import CertaintyEquivalence
 from erl_torch.learners.efficient_s1.algorithm import EfficientS1, EfficientState, OnlineState
 from erl_torch.learners.exact import Exact, ExactState
 from erl_torch.learners.learner import NonFiniteError
 from erl_torch.learners.s1.algorithm import AlgorithmS1, ListedS1, S1State
-
-LEARNERS: dict[str, Any] = {
-    "s1": AlgorithmS1,
-    "s1_listing": ListedS1,
-    "differential_soft_q": DifferentialSoftQ,
-    "rvi_soft_q": RVISoftQ,
-    "u_learning": ULearning,
-    "z_learning": ZLearning,
-    "soft_q": SoftQ,
-    "q_learning": QLearning,
-    "sarsa": Sarsa,
-    "s1_efficient": EfficientS1,
-    "certainty_equivalence": CertaintyEquivalence,
-    "exact": Exact,
-}
-
-
-def states() -> tuple[type, ...]:
-    """All classes that states of learners are made of: what a checkpoint may hold."""
-    from erl_torch.evaluation import Evaluation
-    from erl_torch.learners.action_value.z_learning import ZState
-    from erl_torch.learners.replicas import EachState
-    from erl_torch.learners.s1.lanes import LanesState
-    from erl_torch.solution import Solution, Status
-
-    return (
-        ActionValueState,
-        CertaintyEquivalenceState,
-        EachState,
-        EfficientState,
-        Evaluation,
-        LanesState,
-        NonFiniteError,
-        S1State,
-        Solution,
-        Status,
-        ZState,
-    )
-
 
 __all__ = [
     "LEARNERS",
@@ -84,3 +50,24 @@ __all__ = [
     "ULearning",
     "ZLearning",
 ]
+
+
+@functools.cache
+def by_name() -> dict[str, Any]:
+    """The classes of the learners that ``conf/learner`` has, by the name of their configuration."""
+    classes = {}
+    for name in configurations.names("learner"):
+        path = configurations.folder() / "learner" / f"{name}.yaml"
+        module, _, attribute = yaml.safe_load(path.read_text())["class"].rpartition(".")
+        classes[name] = getattr(importlib.import_module(module), attribute)
+    return classes
+
+
+if TYPE_CHECKING:
+    LEARNERS: dict[str, Any]
+
+
+def __getattr__(name: str) -> object:
+    if name == "LEARNERS":
+        return by_name()
+    raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
