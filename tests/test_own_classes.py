@@ -7,6 +7,7 @@ import re
 import shlex
 import subprocess
 import sys
+from typing import Any
 
 import numpy as np
 import pytest
@@ -259,7 +260,8 @@ def test_from_python_a_configuration_may_name_any_class():
     OmegaConf.update(
         cfg, "learner", {"class": "my_package.Sweeps", "name": "x", "rate": 0.25}, merge=False, force_add=True
     )
-    assert make_learner(cfg.learner, 3, 2).rate == 0.25
+    learner: Any = make_learner(cfg.learner, 3, 2)
+    assert learner.rate == 0.25
     source = OmegaConf.create({"class": "my_package.Biased", "name": "x", "share": 1})
     assert make_source(source) == importlib.import_module("my_package").Biased(share=1.0)
     with pytest.raises(InputError, match=r"env\.class=my_package\.Biased: must be a class derived from gymnasium\.Env"):

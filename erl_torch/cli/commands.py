@@ -10,7 +10,6 @@ import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import hydra
 from omegaconf import DictConfig
@@ -60,7 +59,7 @@ CONF = configurations.folder()
 
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="train")
 @cli.job
-def _train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None]) -> Any:
+def _train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None]) -> object:
     from erl_torch.run.training import train as run
 
     return run(cfg, directory, safe_point)["objective"]
@@ -68,7 +67,7 @@ def _train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None]) -> 
 
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="compare")
 @cli.job
-def _compare(cfg: DictConfig, directory: Path, safe_point: Callable[[], None]) -> Any:
+def _compare(cfg: DictConfig, directory: Path, safe_point: Callable[[], None]) -> object:
     from erl_torch.run.compare import run_comparison
 
     return run_comparison(cfg, directory, safe_point)
@@ -88,7 +87,7 @@ def _play(cfg: DictConfig) -> None:
 
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="reproduce")
 @cli.job
-def _reproduce(cfg: DictConfig, directory: Path, safe_point: Callable[[], None]) -> Any:
+def _reproduce(cfg: DictConfig, directory: Path, safe_point: Callable[[], None]) -> None:
     from erl_torch.reproduction.runner import reproduce as run
 
     run(cfg, directory, safe_point)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from hydra import compose, initialize_config_dir
 from hydra._internal.utils import get_args_parser
@@ -19,7 +18,7 @@ NOT_COMPARED = ("exact",)  # it solves the model, and learns from no stream
 COMMANDS = {"train": Train, "compare": Compare, "reproduce": Reproduce, "play": Play}
 
 
-def slug(text: Any) -> str:
+def slug(text: object) -> str:
     """``text`` as part of a file name: no separators, nothing a shell would touch."""
     return re.sub(r"[^A-Za-z0-9_.=+]+", "-", str(text)).strip("-.") or "run"
 

@@ -15,8 +15,10 @@ import traceback
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
+from hydra.conf import HydraConf
 from hydra.core import utils as hydra_utils
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, OverrideParseException
@@ -68,7 +70,7 @@ class Signals:
             self._before = {n: signal.signal(n, self._note) for n in numbers}
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, *error: Any) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
         for number, handler in self._before.items():
             signal.signal(number, handler)
         if kind is SystemExit and self.received in (signal.SIGUSR1, signal.SIGUSR2):
@@ -79,7 +81,7 @@ class Signals:
         if self.received is not None:
             raise SystemExit(128 + self.received)
 
-    def _note(self, number: int, frame: Any) -> None:
+    def _note(self, number: int, frame: FrameType | None) -> None:
         self.received = number
         if number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, signal.SIG_DFL)
@@ -87,7 +89,7 @@ class Signals:
             os.write(2, b"\nstopping at the next safe point; what is done will be saved\n")
 
 
-def job(work: Callable[[DictConfig, Path, Callable[[], None]], Any]) -> Callable[[DictConfig], Any]:
+def job(work: Callable[[DictConfig, Path, Callable[[], None]], object]) -> Callable[[DictConfig], object]:
     """A Hydra task out of ``work(cfg, run_directory, safe_point)``.
 
     ``safe_point`` is to be called where the work may be ended: it raises SystemExit after a signal.
@@ -97,7 +99,7 @@ def job(work: Callable[[DictConfig, Path, Callable[[], None]], Any]) -> Callable
     """
 
     @functools.wraps(work)
-    def task(cfg: DictConfig) -> Any:
+    def task(cfg: DictConfig) -> object:
         lasting()  # in a launcher's process too
         hydra = HydraConfig.get()
         directory = Path(hydra.runtime.output_dir)
@@ -138,7 +140,7 @@ def _save_config(cfg: DictConfig, filename: str, output_dir: Path) -> None:
 hydra_utils._save_config = _save_config
 
 
-def _attempt(work: Callable[..., Any], cfg: DictConfig, directory: Path, shared: bool) -> Any:
+def _attempt(work: Callable[..., object], cfg: DictConfig, directory: Path, shared: bool) -> object:
     held = [path for path in _held if directory in path.parents]
     with contextlib.nullcontext() if shared else alone(directory):
         try:
@@ -157,7 +159,7 @@ def _attempt(work: Callable[..., Any], cfg: DictConfig, directory: Path, shared:
             raise
 
 
-def _one_of_many(attempt: Callable[[], Any], hydra: Any, directory: Path) -> Any:
+def _one_of_many(attempt: Callable[[], object], hydra: HydraConf, directory: Path) -> object:
     sweep, number, launcher = Path(hydra.sweep.dir), hydra.job.num, str(hydra.launcher._target_)
     sweeps.note(sweep, number, "running", directory=os.path.relpath(directory, sweep), complaint=None)
     try:

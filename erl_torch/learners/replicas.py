@@ -85,7 +85,7 @@ class ReplicaSolution:
     def __getitem__(self, r: int) -> Solution:
         return self.solutions[r]
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> Any:  # as the attribute of ``Solution`` that it names
         if name not in {f.name for f in fields(Solution)}:
             raise AttributeError(name)
         values = [getattr(solution, name) for solution in self.solutions]
@@ -180,7 +180,11 @@ class Replicas(Together):
         return self.solution(state, history)
 
     def iterate(
-        self, experience: ReplicaExperience, n_states: int, n_actions: int, state: Any = None
+        self,
+        experience: ReplicaExperience,
+        n_states: int,
+        n_actions: int,
+        state: Any = None,  # of the engine that runs
     ) -> Iterator[ReplicaState]:
         """Yield the state of all replicas after each epoch, from ``state`` on, until the last is done or has failed."""
         self._check(experience, n_states, n_actions)
@@ -264,7 +268,7 @@ class Replicas(Together):
             raise InputError("experience", f"an MDP of shape {shape}", f"of shape {(n_states, n_actions)}")
 
 
-def _number(value: Any) -> Any:
+def _number(value: np.ndarray | float) -> object:
     """A plain number of a NumPy or torch scalar."""
     return value.item() if np.ndim(value) == 0 and hasattr(value, "item") else value
 
@@ -314,13 +318,14 @@ def each(
     states = list(state.states) if state else [learner.init(n_states, n_actions) for learner in learners]
     failures = dict(state.failures) if state else {}
 
-    def go_on(r: int) -> Any:
+    def go_on(r: int) -> StreamState | NonFiniteError:
         try:
             stream = held[r]
             if stream is None:
                 stream = learners[r].prepare(tuples_of(experience, r, prior), n_states, n_actions)
                 held[r] = stream if hold else None
-            return learners[r].step(states[r], stream)
+            after: StreamState = learners[r].step(states[r], stream)
+            return after
         except NonFiniteError as error:
             return error
 

@@ -24,7 +24,7 @@ from erl_torch.experience.simulation import KEEP_BYTES, TUPLE_BYTES, ReplicaExpe
 from erl_torch.experience.sources import Source
 from erl_torch.experience.transitions import Transitions, join
 from erl_torch.files import read_npy
-from erl_torch.learners.learner import Learner
+from erl_torch.learners.learner import Learner, TabularLearner
 from erl_torch.mdp.from_gymnasium import MeanRewardWarning, absorbing, has_table, known_mdp, sizes, tabular_mdp
 from erl_torch.mdp.tabular import TabularMDP, check_policy
 from erl_torch.notes import note
@@ -159,14 +159,14 @@ def _control_world(cfg: DictConfig, env: gym.Env[Any, Any], safe_point: SafePoin
     return World(TabularMDP(mdp.transition, mdp.reward), mdp)
 
 
-def make_problem(cfg: DictConfig, env: gym.Env[Any, Any], world: World, learner: Any) -> Problem:
+def make_problem(cfg: DictConfig, env: gym.Env[Any, Any], world: World, learner: TabularLearner[Any]) -> Problem:
     """What there is to learn in ``env`` as the run ``cfg`` says, with the prior of ``learner``. Raises InputError."""
     prior = check_policy("learner.prior_policy", learner.prior_policy, *sizes(env))
     horizon = min(cfg.evaluation.horizon, (env.spec and env.spec.max_episode_steps) or cfg.evaluation.horizon)
     return Problem(env, world.source, prior, world.mdp, world.episode, horizon, cfg.env.name)
 
 
-def learner_class(cfg: DictConfig, key: str = "learner") -> Any:
+def learner_class(cfg: DictConfig, key: str = "learner") -> type:
     """The class of the learner of ``cfg``. Raises InputError, under ``key``."""
     kind = resolve(cfg.get("class"), f"{key}.class")
     absent = [name for name in CONTRACT if not hasattr(kind, name) and name not in parameters(kind)]
@@ -175,9 +175,9 @@ def learner_class(cfg: DictConfig, key: str = "learner") -> Any:
     return kind
 
 
-def make_learner(cfg: DictConfig, n_states: int, n_actions: int, key: str = "learner") -> Any:
+def make_learner(cfg: DictConfig, n_states: int, n_actions: int, key: str = "learner") -> TabularLearner[Any]:
     """The learner of ``cfg``; complaints name their keys under ``key``."""
-    learner = _made(cfg, learner_class(cfg, key), key)
+    learner: TabularLearner[Any] = _made(cfg, learner_class(cfg, key), key)
     check_sizes(n_states, n_actions)
     with group(key):
         learner.init(n_states, n_actions)  # validates the prior against the sizes
@@ -193,7 +193,7 @@ def make_source(cfg: DictConfig, key: str = "experience") -> Source:
     return source
 
 
-def _made(cfg: DictConfig, kind: type, key: str) -> Any:
+def _made(cfg: DictConfig, kind: type, key: str) -> Any:  # of ``kind``, whatever that is
     """The dataclass ``kind`` with the settings of ``cfg``; the prior policy is a file there."""
     with group(key):
         values: Any = OmegaConf.to_container(cfg, resolve=True)

@@ -196,7 +196,7 @@ def encode(value: object) -> object:
     return value.detach().cpu() if isinstance(value, torch.Tensor) else value
 
 
-def decode(value: object, classes: Iterable[type], device: str = "cpu") -> Any:
+def decode(value: object, classes: Iterable[type], device: str = "cpu") -> Any:  # whatever was encoded
     """What ``encode`` was given. Raises ValueError for a class that is not one of ``classes``."""
     by_name: dict[str, Any] = {one.__name__: one for one in classes}
 

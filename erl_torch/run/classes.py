@@ -98,7 +98,7 @@ def settings_of(values: Mapping[str, Any], kind: type, others: tuple[str, ...]) 
     return {key: _typed(key, value, takes[key].annotation) for key, value in values.items() if key in takes}
 
 
-def _typed(key: str, value: object, annotation: object) -> Any:
+def _typed(key: str, value: object, annotation: object) -> Any:  # as annotated
     text = annotation if isinstance(annotation, str) else inspect.formatannotation(annotation)
     types = {one.strip() for one in text.split("|")}
     if len(types - {"None"}) != 1 or not types <= {*NODES, "None"}:

@@ -219,7 +219,7 @@ def _run(
     return rows
 
 
-def interquartile_mean(values: np.ndarray, axis: int = -1) -> Any:
+def interquartile_mean(values: np.ndarray, axis: int = -1) -> Any:  # a number, or an array
     """Mean of the middle half: a quarter of the values, rounded down, is left out at either end."""
     return scipy.stats.trim_mean(values, 0.25, axis=axis)
 

@@ -23,7 +23,7 @@ from erl_torch.experience.experience import Experience
 from erl_torch.experience.simulation import ReplicaExperience, Simulation, streams_of
 from erl_torch.experience.sources import Source
 from erl_torch.experience.transitions import Transitions
-from erl_torch.learners.learner import TabularLearner
+from erl_torch.learners.learner import Table, TabularLearner
 from erl_torch.learners.replicas import Replicas, ReplicaSolution
 from erl_torch.log.tensorboard import hyperparameters
 from erl_torch.mdp.from_gymnasium import known_mdp, sizes
@@ -160,7 +160,7 @@ def train(
     return solution
 
 
-def _problem(given: Given, prior_policy: Any, horizon: int) -> Problem:
+def _problem(given: Given, prior_policy: Table, horizon: int) -> Problem:
     """As a ``Problem``, with the prior of the learner. Raises InputError."""
     if isinstance(given, Problem):
         prior = check_policy("learner.prior_policy", prior_policy, given.n_states, given.n_actions)
@@ -193,7 +193,7 @@ def _of_replicas(
     return held, seeds
 
 
-def _digest(experience: Experience | ReplicaExperience | None) -> Any:
+def _digest(experience: Experience | ReplicaExperience | None) -> object:
     if experience is None or isinstance(experience, Simulation):
         return None
     if isinstance(experience, Sequence):
@@ -205,7 +205,11 @@ def _digest(experience: Experience | ReplicaExperience | None) -> Any:
 
 
 def _described(
-    learner: Any, problem: Problem, experience: object, seed: int, settings: EvaluationSettings
+    learner: TabularLearner[Any] | Replicas,
+    problem: Problem,
+    experience: object,
+    seed: int,
+    settings: EvaluationSettings,
 ) -> dict[str, Any]:
     """Settings by name: a directory of other settings is refused."""
     if isinstance(learner, Replicas):
@@ -227,7 +231,7 @@ def _described(
     }
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> Any:  # what YAML and JSON hold
     """Numbers, text and containers; of an array or a model its shape and the SHA-256 of its bytes."""
     if isinstance(value, TabularMDP):
         p = value.transition

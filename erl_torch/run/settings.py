@@ -132,7 +132,7 @@ def check_reproduction_keys(cfg: DictConfig) -> None:
     _check_node(cfg, Reproduce, "")
 
 
-def _check_node(node: DictConfig, schema: Any, prefix: str) -> None:
+def _check_node(node: DictConfig, schema: Any, prefix: str) -> None:  # a dataclass
     names = [field.name for field in fields(schema)] if is_dataclass(schema) else list(map(str, node))
     for name in map(str, node):
         if name not in names:

@@ -115,7 +115,7 @@ def _common(
     saved: Checkpoints,
     safe_point: SafePoint,
     began: float,
-    **more: Any,
+    **more: Any,  # hyperparameters
 ) -> dict[str, Any]:
     """Arguments of ``Run`` that all runs of a configuration share."""
     return {
@@ -165,7 +165,7 @@ def _single(
 
 def _replicas(
     cfg: DictConfig,
-    learner: Any,
+    learner: TabularLearner[Any],
     problem: Problem,
     settings: EvaluationSettings,
     saved: Checkpoints,
