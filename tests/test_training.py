@@ -237,9 +237,11 @@ def learning(cwd):
 
 
 def signalled(cwd, send):
-    """Call ``send`` once the run below ``cwd`` is inside its epochs."""
-    wait_until(lambda: learning(cwd), "an epoch")
-    send()
+    """Call ``send`` once the run below ``cwd`` is inside its epochs, or has not come there: it has no end."""
+    try:
+        wait_until(lambda: learning(cwd), "an epoch")
+    finally:
+        send()
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
