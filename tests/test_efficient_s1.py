@@ -356,6 +356,16 @@ def test_no_setting_gives_nan(problem, beta, reward_scale, shift, switches, step
         check(state)
 
 
+def test_u_is_of_the_pairs_that_take_part():
+    """One state, one of two actions tried: u has mean 1 and is 0 where nothing was tried, however small z has become."""
+    tuples = 400
+    same = np.zeros(tuples, np.int32)
+    data = Transitions(same, same, np.full(tuples, -100.0), same, same)
+    for beta in (1.0, 1e2, 1e4):
+        *_, state = EfficientS1(beta).online([data], 1, 2)
+        assert state.u.tolist() == [[2.0, 0.0]]
+
+
 def check(state):
     for name in ("log_z", "log_average", "log_psi", "log_mean_psi", "mean_log_psi", "policy", "u", "psi"):
         assert torch.isfinite(getattr(state, name)).all(), name

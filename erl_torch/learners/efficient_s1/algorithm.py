@@ -157,8 +157,8 @@ class EfficientState:
     @property
     def u(self) -> torch.Tensor:
         """[S, A], mean 1; 0 on pairs that take no part, or below double precision."""
-        log_u = self.log_average - self.log_psi_in_use[:, None]
-        u = (log_u - log_u.max()).exp() * (self.weight > 0)
+        log_u = torch.where(self.weight > 0, self.log_average - self.log_psi_in_use[:, None], -torch.inf)
+        u = (log_u - log_u.max()).exp()  # the largest of those that take part: one outside could be beyond all of them
         return u / u.mean()
 
     @property
