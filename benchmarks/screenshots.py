@@ -36,7 +36,7 @@ FLAGS = (
 SHOTS = {
     "custom-scalars": ("one", "#custom_scalars&_smoothingWeight=0", 1300, 2100),
     "images": ("one", "#images", 1300, 1300),
-    "scalars": ("sweep", "#scalars&_smoothingWeight=0&tagFilter=%5Eeval%7C(learner%7Cs1)/theta%24", 1300, 1000),
+    "scalars": ("sweep", "#scalars&_smoothingWeight=0&tagFilter=%5Eeval%7Clearner/theta%24", 1300, 1000),
     "hparams": ("sweep", "#hparams", 2350, 620),
     "replicas": ("replicas", "#custom_scalars&_smoothingWeight=0", 1300, 1500),
 }

@@ -357,7 +357,7 @@ def test_no_setting_gives_nan(problem, beta, reward_scale, shift, switches, step
 
 
 def test_u_is_of_the_pairs_that_take_part():
-    """One state, one of two actions tried: u has mean 1 and is 0 where nothing was tried, however small z has become."""
+    """One state, one of two actions tried: u has mean 1 and is 0 where nothing was tried, however small z is."""
     tuples = 400
     same = np.zeros(tuples, np.int32)
     data = Transitions(same, same, np.full(tuples, -100.0), same, same)

@@ -2,17 +2,21 @@
 
 import json
 import warnings
+from dataclasses import dataclass
+from typing import ClassVar
 
 import gymnasium as gym
+import numpy as np
 import pytest
 import torch
 from helpers import composed, events
 
 import erl_torch
-from erl_torch import AlgorithmS1, EvaluationSettings, InputError, Note, Replicas, Simulation
+from erl_torch import AlgorithmS1, EvaluationSettings, InputError, Note, Replicas, Simulation, StreamLearner
 from erl_torch.envs.windy_cliff import WindyCliffEnv
 from erl_torch.experience.sources import Simulate
 from erl_torch.learners import Exact
+from erl_torch.learners.learner import columns
 from erl_torch.run.training import train as train_configured
 
 MDP = WindyCliffEnv().mdp
@@ -137,3 +141,92 @@ def test_a_directory_of_another_run_is_refused(tmp_path, tuples, other):
         other = {"problem": WindyCliffEnv(wind_strength=0.5).mdp}
     with pytest.raises(InputError, match="with these settings, or a new one"):
         erl_torch.train(**(arguments | other))
+
+
+# -- learners of one's own that a run cannot hold -------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Counted:
+    n_tuples: int
+    epoch: int
+    policy: torch.Tensor
+    more: object = None
+    theta: ClassVar[None] = None
+    reward_bias: ClassVar[None] = None
+
+    def metrics(self):
+        return self.more if isinstance(self.more, dict) and self.epoch else {"epoch": self.epoch}
+
+
+@dataclass(frozen=True)
+class Counts(StreamLearner):
+    """Three passes, of which ``second`` is what the state of the second holds."""
+
+    states: ClassVar[tuple[type, ...]] = (Counted,)
+    beta: float = 10.0
+    prior_policy: None = None
+    first: object = None
+    second: object = None
+
+    def init(self, n_states, n_actions):
+        return Counted(0, 0, torch.full((n_states, n_actions), 1 / n_actions, dtype=torch.float64), self.first)
+
+    def prepare(self, transitions, n_states, n_actions):
+        return len(transitions)
+
+    def step(self, state, stream):
+        more = self.second if state.epoch == 1 else None
+        return Counted(state.n_tuples + stream, state.epoch + 1, state.policy, more)
+
+    def finished(self, state):
+        return state.epoch == 3
+
+    def solution(self, state, history=(), failure=None):
+        q = torch.zeros_like(state.policy)
+        end = {"n_steps": state.n_tuples, "status": self.ended(state, failure), "history": columns(history)}
+        return erl_torch.Solution.of_action_values(q, state.policy, self.beta, None, **end)
+
+
+class Odd:
+    pass
+
+
+@dataclass(frozen=True)
+class NotNamed(Counts):
+    states: ClassVar[tuple[type, ...]] = ()
+
+
+@pytest.mark.parametrize(
+    ("learner", "message"),
+    [
+        (Counts(first=Odd()), "learner=Counted: must be a learner whose states are of numbers.*a Odd has no place"),
+        (NotNamed(), r"learner=Counted: must be .*the classes in its states \(unknown class Counted"),
+    ],
+)
+def test_what_no_checkpoint_can_hold_is_refused_at_the_start(tmp_path, tuples, learner, message):
+    with pytest.raises(InputError, match=message):
+        erl_torch.train(learner, MDP, tuples, directory=tmp_path / "run", evaluation=QUICK)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("second", "message"),
+    [
+        ({"epoch": "two"}, "metrics of the learner, epoch=two: must be a number"),
+        ({"pass": 2}, "metrics of the learner=epoch, pass: must be the same names in every state"),
+    ],
+)
+def test_metrics_that_change_end_the_run_and_what_was_learnt_is_kept(tmp_path, tuples, second, message):
+    with pytest.raises(InputError) as error:
+        erl_torch.train(Counts(second=second), MDP, tuples, directory=tmp_path, evaluation=QUICK)
+    assert str(error.value).startswith(message)
+    result = json.loads((tmp_path / "result.json").read_text())
+    assert (result["status"], result["n_tuples"]) == ("stopped", len(tuples))
+
+
+def test_containers_numbers_and_arrays_come_back(tmp_path, tuples):
+    held = {"a": [1, 2.5, None, True, "x", (3,)], 4: np.arange(3.0), "t": torch.ones(2), "s": np.float32(1.5)}
+    learner = Counts(first=held)
+    erl_torch.train(learner, MDP, tuples, directory=tmp_path, evaluation=QUICK, checkpoint_every=0)
+    assert json.loads((tmp_path / "result.json").read_text())["status"] == "completed"

@@ -193,7 +193,20 @@ def encode(value: object) -> object:
         return value.item()
     if isinstance(value, Enum):
         return {"class": type(value).__name__, "member": value.name}
-    return value.detach().cpu() if isinstance(value, torch.Tensor) else value
+    if isinstance(value, torch.Tensor):
+        return value.detach().cpu()
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    raise TypeError(f"a {type(value).__name__} has no place in a checkpoint")
+
+
+def check_state(state: object, classes: Iterable[type]) -> None:
+    """Raise InputError unless a checkpoint can hold ``state`` and give it back, being made of ``classes``."""
+    try:
+        decode(encode(state), (*COMMON, *classes))
+    except (TypeError, ValueError) as error:
+        allowed = "a learner whose states are of numbers, tensors, arrays, containers and the classes in its states"
+        raise InputError("learner", type(state).__name__, f"{allowed} ({error})") from error
 
 
 def decode(value: object, classes: Iterable[type], device: str = "cpu") -> Any:  # whatever was encoded

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
+import numpy as np
 from tqdm import tqdm
 
 from erl_torch.checks import InputError
@@ -20,7 +21,7 @@ from erl_torch.files import write_json
 from erl_torch.learners.learner import Learner, NonFiniteError, State, columns
 from erl_torch.log.tensorboard import Board, Boards
 from erl_torch.problem import Problem
-from erl_torch.run.checkpoint import Checkpoints, Content, Ended, rows_of
+from erl_torch.run.checkpoint import Checkpoints, Content, Ended, check_state, rows_of
 from erl_torch.run.origin import texts
 
 SafePoint = Callable[[], None]
@@ -128,6 +129,8 @@ class Run(Generic[S, E, A]):
         """
         saved, recorder, learner = self.saved, self.recorder, self.learner
         outcome = Outcome(learner.start(self.problem))
+        if not learner.needs_model:
+            check_state(outcome.state, learner.states)
         checkpoint, began = saved.start(learner.states), self.began
         if checkpoint:
             if checkpoint["digest"] != self.digest:
@@ -135,21 +138,21 @@ class Run(Generic[S, E, A]):
             outcome = Outcome(checkpoint["state"], [*rows_of(checkpoint["history"])], checkpoint["learning"])
             recorder.restore(checkpoint)
             began -= checkpoint["seconds"]
-        else:
-            recorder.begin()
         solution: A | None = None
         ended = Ended(lambda: solution is not None)
-        mark = checkpoint["events"] if checkpoint else None
-        board = Board(saved.directory, self.hyperparameters, recorder.boards, mark)
-        with ended, saved.refusing(lambda: bool(outcome.history)), board:
+        with ended, saved.refusing(lambda: bool(outcome.history)):
             if not checkpoint:
-                board.texts(texts(self.configuration, saved.directory))
-            recorder.open(board, checkpoint is not None)
-            self._learn(outcome, checkpoint is not None, board, ended, began)
-            solution = learner.solution(outcome.state, outcome.history, outcome.stopped)
-            solution = recorder.finish(outcome, solution, board)
-            if isinstance(outcome.stopped, NonFiniteError) or recorder.failed(solution) is not None:
-                board.failed()
+                recorder.begin()
+            mark = checkpoint["events"] if checkpoint else None
+            with Board(saved.directory, self.hyperparameters, recorder.boards, mark) as board:
+                if not checkpoint:
+                    board.texts(texts(self.configuration, saved.directory))
+                recorder.open(board, checkpoint is not None)
+                self._learn(outcome, checkpoint is not None, board, ended, began)
+                solution = learner.solution(outcome.state, outcome.history, outcome.stopped)
+                solution = recorder.finish(outcome, solution, board)
+                if isinstance(outcome.stopped, NonFiniteError) or recorder.failed(solution) is not None:
+                    board.failed()
         assert solution is not None
         outcome.stopped = outcome.stopped or ended.error
         recorder.save(solution, saved.directory)
@@ -191,7 +194,7 @@ class Run(Generic[S, E, A]):
                 bar.update(learner.work(outcome.state))
                 states = learner.run(self.problem, self.experience, outcome.state if goes_on else None)
                 for state in _timed(states, outcome):
-                    row = state.metrics()
+                    row = _checked(state.metrics(), outcome.history)
                     outcome.state = state
                     outcome.history.append(row)
                     milestone = learner.milestone(state)
@@ -223,6 +226,17 @@ class Run(Generic[S, E, A]):
             disable=None if self.talks else True,
             bar_format="{l_bar}{bar:20}| {elapsed}<{remaining}, {rate_fmt}{postfix}" if total else None,
         )  # fmt: skip
+
+
+def _checked(row: Row, before: list[Row]) -> Row:
+    """``row``, if it is numbers under the names of the rows before. Raises InputError."""
+    for name, value in row.items():
+        if np.asarray(value).dtype.kind not in "biuf":
+            raise InputError(f"metrics of the learner, {name}", value, "a number, or one per replica")
+    if before and row.keys() != before[0].keys():
+        differ = ", ".join(sorted(row.keys() ^ before[0].keys()))
+        raise InputError("metrics of the learner", differ, "the same names in every state")
+    return row
 
 
 def _timed(states: Iterator[S], outcome: Outcome[S]) -> Iterator[S]:
