@@ -102,8 +102,8 @@ def hyperparameters(settings: Mapping[str, Any], **more: object) -> dict[str, in
         settings: the configuration as plain containers, with ``env``, ``learner`` and ``seed``.
         more: settings that are no part of it.
     """
-    env = {f"env.{k}": v for k, v in settings["env"].items() if k not in ("name", "id", "suggest")}
-    learner = {k: v for k, v in settings["learner"].items() if k != "name"}
+    env = {f"env.{k}": v for k, v in settings["env"].items() if k not in ("class", "name", "id", "suggest")}
+    learner = {k: v for k, v in settings["learner"].items() if k not in ("class", "name")}
     names = {"env": settings["env"]["name"], "learner": settings["learner"]["name"]}
     return {
         key: value if isinstance(value, (int, float, str)) and not isinstance(value, bool) else json.dumps(value)
