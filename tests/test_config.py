@@ -165,7 +165,7 @@ def test_whole_numbers_beyond_64_bits_are_named(tmp_path, key):
     [
         ("experience.n_episodes=1000000000000", "experience.n_episodes=1000000000000: must be smaller: a stream of"),
         ("experience.episode_length=1000000000000", "experience.n_episodes=500: must be smaller: a stream of"),
-        ("n_replicas=1000000000", "n_replicas=1000000000: must be smaller: a learner each"),
+        ("n_replicas=1000000000", "n_replicas=1000000000: must be smaller: one learner per replica"),
         ("evaluation.n_episodes=1000000000000", "evaluation.n_episodes=1000000000000: must be smaller: the returns"),
         ("threads=100000", "threads=100000: must be at most 1024"),
         ("env=windy_maze env.size=1000000", "env.size=1000000: must be smaller: a maze of"),

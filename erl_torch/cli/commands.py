@@ -25,7 +25,7 @@ python train.py learner.beta=5 experience.n_episodes=200
 python train.py env=FrozenLake-v1                      any environment of Gymnasium's with finite spaces
 python train.py learner=s1_efficient                   the learner to use
 python train.py learner.class=my_package.MyLearner     one of your own; env.class and experience.class likewise
-python train.py -m learner.beta=2,5,10 seed=0,1        one run a combination
+python train.py -m learner.beta=2,5,10 seed=0,1        one run per combination
 tensorboard --logdir runs                              look at the runs
 """
 

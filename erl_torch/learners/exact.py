@@ -1,7 +1,7 @@
 """The exact solvers as a learner: nothing is learnt from experience, the environment's model is solved.
 
-``method="biasing"`` runs the paper's Algorithm 1, one state a biasing iteration; ``method="soft_bellman"`` soft policy
-iteration, one state a Newton step (``erl_torch.solvers``).
+``method="biasing"`` runs the paper's Algorithm 1, one state per biasing iteration;
+``method="soft_bellman"`` soft policy iteration, one state per Newton step (``erl_torch.solvers``).
 """
 
 from __future__ import annotations

@@ -7,12 +7,12 @@ Each replica is one of ``learners``, and comes out as if it had run alone, bit f
 and the size of the blocks. Where the experience comes from:
 
     Transitions              one stream that all replicas learn from
-    [Transitions, ...]       a recorded stream each
-    Simulation(mdp, seeds)   a stream each, of its seed: the tuples that ``collect`` gives for it. They are kept where
-                             they fit (``keep``), else sampled again in every pass, in memory that does not grow.
+    [Transitions, ...]       one recorded stream per replica
+    Simulation(mdp, seeds)   one stream per replica, of its seed: the tuples that ``collect`` gives for it. They are
+                             kept where they fit (``keep``), else sampled again in every pass, in memory that does not grow.
 
 Published Algorithm S1 runs with its replicas interleaved in one compiled loop (``erl_torch.learners.s1.lanes``), or in
-torch operations on a device (``erl_torch.learners.s1.device``); all other learners a replica a thread.
+torch operations on a device (``erl_torch.learners.s1.device``); all other learners with one replica per thread.
 
 A replica that leaves the finite numbers stays at its last good epoch, named in ``failures``; the others go on.
 """
@@ -154,7 +154,7 @@ class Replicas(Together):
         backend: str = "auto",
         **vectors: Iterable[float],
     ) -> Replicas:
-        """``learner`` times ``n_replicas``; ``vectors`` give some of its arguments a value a replica, [R]."""
+        """``learner`` times ``n_replicas``; ``vectors`` give some of its arguments one value per replica, [R]."""
         check_learner("learner", learner)
         n_replicas = None if n_replicas is None else checks.at_least("n_replicas", n_replicas, 1)
         names = {f.name for f in fields(learner)}
@@ -273,7 +273,7 @@ def _number(value: np.ndarray | float) -> object:
     return value.item() if np.ndim(value) == 0 and hasattr(value, "item") else value
 
 
-# -- a replica a thread -------------------------------------------------------------------------------
+# -- one replica per thread -------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)

@@ -214,7 +214,7 @@ def check_sizes(n_states: int, n_actions: int, n_replicas: int = 1) -> None:
     needed = n_replicas * (8 * TABLES * n_pairs + REPLICA_BYTES)
     what = f"{n_states:,} states and {n_actions:,} actions, in {TABLES} tables"
     if n_replicas > 1:
-        checks.memory("n_replicas", n_replicas, needed, f"a learner each, of {what}")
+        checks.memory("n_replicas", n_replicas, needed, f"one learner per replica, of {what}")
     else:
         checks.memory("n_states * n_actions", f"{n_states} * {n_actions}", needed, what)
 

@@ -207,7 +207,7 @@ def _run(
     sizes: tuple[int, ...],
     best: Optimum,
 ) -> list[tuple[dict[str, float], Status]]:
-    """One learner on one stream, a row a size."""
+    """One learner on one stream, one row per size."""
     mdp, n_episodes, episode_length = experience
     data = collect(mdp, n_episodes, episode_length, seed, behaviour_policy, prior)
     rows = []

@@ -179,7 +179,7 @@ class AlgorithmS1(StreamLearner[S1State, S1Stream]):
     Args:
         beta: inverse temperature, 1/reward, > 0.
         lr_u, lr_rho, lr_psi: step sizes in (0, 1] of lines 10, 11 and 2-3; lr_rho None is lr_u / n_states.
-        n_epochs: passes over the stream a u phase.
+        n_epochs: passes over the stream per u phase.
         n_bias: biasing iterations, the unbiased first included.
         psi_tol: relative error between epochs that ends a psi phase.
         max_psi_epochs: limit on the epochs of a psi phase.

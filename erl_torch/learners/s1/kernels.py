@@ -181,7 +181,7 @@ def u_epoch(
 def _lanes_rows(
     pair, pair_next, factor, noisy, g, z, q, lr_u, lr_rho, inv_rho_min, new, step_k, step_lane, begin, end
 ):  # fmt: skip
-    """Rows begin..end of streams [n, lanes], a stream a lane; z [n_pairs * lanes] and q [lanes] change in place."""
+    """Rows begin..end of streams [n, lanes], one stream per lane; z [n_pairs * lanes] and q [lanes] change in place."""
     # Unsigned: Numba would look at the sign of every other index.
     step_k, step_lane = np.uint64(step_k), np.uint64(step_lane)
     for t in range(begin, end):

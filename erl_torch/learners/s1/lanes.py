@@ -1,4 +1,4 @@
-"""Algorithm S1 for many replicas in one compiled loop, a lane each (the engine of ``Replicas``).
+"""Algorithm S1 for many replicas in one compiled loop, one lane per replica (the engine of ``Replicas``).
 
 Between the streams the tables have a leading axis [R]; in the u phase blocks of replicas are interleaved, so that one
 fills the time in which another waits for its division. Lines, gauge and open points: ``algorithm_s1``.
