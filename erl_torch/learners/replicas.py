@@ -9,7 +9,8 @@ and the size of the blocks. Where the experience comes from:
     Transitions              one stream that all replicas learn from
     [Transitions, ...]       one recorded stream per replica
     Simulation(mdp, seeds)   one stream per replica, of its seed: the tuples that ``collect`` gives for it. They are
-                             kept where they fit (``keep``), else sampled again in every pass, in memory that does not grow.
+                             kept where they fit (``keep``), else sampled again in every pass, in memory that does
+                             not grow.
 
 Published Algorithm S1 runs with its replicas interleaved in one compiled loop (``erl_torch.learners.s1.lanes``), or in
 torch operations on a device (``erl_torch.learners.s1.device``); all other learners with one replica per thread.
