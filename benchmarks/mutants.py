@@ -1887,6 +1887,63 @@ MUTANTS = [
         "row[p.data > 0]]",
         "test_interval_rules.py::test_any_row_may_hide_what_is_met_from_most_states",
     ),
+    # -- the one run loop
+    Mutant(
+        "figures of a broken epoch stay",
+        "run/loop.py",
+        'recorder.back(last["recorder"])',
+        "pass",
+        "test_checkpoint.py::test_any_error_keeps_what_was_learnt",
+    ),
+    Mutant(
+        "rows of a broken epoch stay",
+        "run/loop.py",
+        'del outcome.history[last["n"] :]',
+        "pass",
+        "test_checkpoint.py::test_any_error_keeps_what_was_learnt",
+    ),
+    Mutant(
+        "a run goes on with another stream",
+        "run/loop.py",
+        'if checkpoint["digest"] != self.digest:',
+        "if False:",
+        "test_checkpoint.py",
+    ),
+    Mutant(
+        "metrics may change their names",
+        "run/loop.py",
+        "if before and row.keys() != before[0].keys():",
+        "if False:",
+        "test_session.py::test_metrics_that_change_end_the_run_and_what_was_learnt_is_kept",
+    ),
+    Mutant(
+        "a state that no checkpoint gives back is learnt with",
+        "run/checkpoint.py",
+        "decode(encode(state), (*COMMON, *classes))",
+        "encode(state)",
+        "test_session.py::test_what_no_checkpoint_can_hold_is_refused_at_the_start",
+    ),
+    Mutant(
+        "replicas of a temperature are a group each",
+        "run/groups.py",
+        "if r == 0 or settings[r] != settings[r - 1]",
+        "if True",
+        "test_session.py::test_replicas_of_two_temperatures",
+    ),
+    Mutant(
+        "the exact solver takes tuples and forgets them",
+        "run/session.py",
+        "if learner.needs_model != (experience is None):",
+        "if not learner.needs_model and experience is None:",
+        "test_session.py::test_bad_arguments_are_named",
+    ),
+    Mutant(
+        "what was never tried sets the scale of u",
+        "learners/efficient_s1/algorithm.py",
+        "log_u = torch.where(self.weight > 0, self.log_average - self.log_psi_in_use[:, None], -torch.inf)",
+        "log_u = self.log_average - self.log_psi_in_use[:, None]",
+        "test_efficient_s1.py::test_u_is_of_the_pairs_that_take_part",
+    ),
 ]
 
 
