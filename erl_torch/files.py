@@ -90,17 +90,18 @@ def write_png(path: str | os.PathLike[str], pixels: np.ndarray) -> Path:
 
 
 @contextlib.contextmanager
-def alone(directory: str | os.PathLike[str]) -> Iterator[None]:
+def alone(directory: str | os.PathLike[str], key: str = "hydra.run.dir") -> Iterator[None]:
     """Lock a run directory. The lock ends with the process, however that ends, and leaves no file.
 
-    Raises InputError if another process holds the lock. A file system without locks lets every process in.
+    Raises InputError under ``key`` if another process holds the lock. A file system without locks lets every process
+    in.
     """
     descriptor = os.open(directory, os.O_RDONLY)
     try:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            raise InputError("hydra.run.dir", directory, "a directory that no other run is writing to") from error
+            raise InputError(key, directory, "a directory that no other run is writing to") from error
         except OSError:
             pass
         yield

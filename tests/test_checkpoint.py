@@ -172,10 +172,10 @@ def test_checkpoints_know_their_settings(tmp_path, cut):
 
 def test_checkpoints_of_another_version_stay(cut, monkeypatch):
     cfg, directory, _ = cut
-    monkeypatch.setattr("erl_torch.run.checkpoint.FORMAT", 3)
+    monkeypatch.setattr("erl_torch.run.checkpoint.FORMAT", 4)
     before = files(directory)
     with pytest.raises(
-        InputError, match=r"checkpoint=.*12000.ckpt: must be of this version \(it is of format 2, not 3"
+        InputError, match=r"checkpoint=.*12000.ckpt: must be of this version \(it is of format 3, not 4"
     ):
         train(cfg, directory)
     assert files(directory) == before
@@ -427,7 +427,7 @@ def test_values_come_back_as_they_were():
     assert isinstance(answer, Solution)
     assert answer.status is Status.COMPLETED
     with pytest.raises(ValueError, match="unknown class Path"):
-        decode({"class": "Path"}, COMMON)
+        decode({"class": "Path", "fields": {}}, COMMON)
 
 
 def test_checksum_sees_every_column():

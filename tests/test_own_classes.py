@@ -227,6 +227,19 @@ def test_resuming_imports_nothing_that_is_not_named_again(tmp_path, typed_here, 
     assert path.read_text() == content
 
 
+@pytest.mark.parametrize(
+    "hostile", ["learner.s1.class=trap.Trap", "++learner.s1={class: trap.Trap, name: x}", "env.class=trap.Trap"]
+)
+def test_resuming_a_comparison_imports_nothing_that_is_not_named_again(tmp_path, typed_here, trap, hostile):
+    path = tmp_path / "run" / ".hydra" / "overrides.yaml"
+    path.parent.mkdir(parents=True)
+    path.write_text(OmegaConf.to_yaml(OmegaConf.create(["learners=[s1]", "seeds=1", "n_sizes=1", hostile])))
+    code, _, err = typed_here("compare.py", "resume=run")
+    assert code == 1
+    assert err.startswith("error: ")
+    assert not trap.exists()
+
+
 def test_what_is_named_again_is_imported(tmp_path, typed_here, trap):
     path = tmp_path / "run" / ".hydra" / "overrides.yaml"
     path.parent.mkdir(parents=True)

@@ -1,9 +1,11 @@
 """A logged run from Python: the run of the command line, silent, and gone on with."""
 
+import collections
+import enum
 import json
 import warnings
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -17,6 +19,7 @@ from erl_torch.envs.windy_cliff import WindyCliffEnv
 from erl_torch.experience.sources import Simulate
 from erl_torch.learners import Exact
 from erl_torch.learners.learner import columns
+from erl_torch.run.checkpoint import check_state, decode, encode
 from erl_torch.run.training import train as train_configured
 
 MDP = WindyCliffEnv().mdp
@@ -61,8 +64,12 @@ def test_it_is_the_run_of_the_command_line(tmp_path, capfd):
     assert solution.theta == result["theta"]
 
 
-class Stop(BaseException):
-    pass
+@dataclass(frozen=True)
+class Nothing(erl_torch.Source):
+    """A source that gives none."""
+
+    def __call__(self, problem, seed, report):
+        return None
 
 
 def test_a_stopped_run_goes_on_and_a_complete_one_is_read(tmp_path, tuples, monkeypatch):
@@ -116,7 +123,7 @@ def test_notes_are_warnings_of_the_caller(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"learner": "s1"}, "learner=str: must be a learner, as AlgorithmS1()"),
+        ({"learner": "s1"}, "learner=s1: must be a learner, as AlgorithmS1()"),
         ({"problem": 3}, "problem=3"),
         ({"experience": None}, "experience=NoneType: must be given: tuples, or a source of them"),
         ({"learner": Exact()}, "experience=Transitions: must be None: the learner solves the model"),
@@ -133,17 +140,49 @@ def test_bad_arguments_are_named(tmp_path, tuples, change, message):
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize("other", [{"seed": 1}, {"learner": AlgorithmS1(n_epochs=3, n_bias=2)}, {"problem": "shaken"}])
+OTHERS: dict[str, Any] = {
+    "seed": lambda: {"seed": 1},
+    "settings": lambda: {"learner": AlgorithmS1(n_epochs=3, n_bias=2)},
+    "class of the same settings": lambda: {"learner": type("AlgorithmS1", (AlgorithmS1,), {})(n_epochs=2, n_bias=2)},
+    "model": lambda: {"problem": WindyCliffEnv(wind_strength=0.5).mdp},
+    "tuples": lambda: {"experience": erl_torch.collect(MDP, 20, 200, seed=1)},
+    "horizon": lambda: {"evaluation": EvaluationSettings(n_episodes=2, pictures=False, horizon=7)},
+}
+
+
+@pytest.mark.parametrize("other", OTHERS)
 def test_a_directory_of_another_run_is_refused(tmp_path, tuples, other):
     arguments = {"learner": SHORT, "problem": MDP, "experience": tuples, "directory": tmp_path, "evaluation": QUICK}
     erl_torch.train(**arguments)
-    if other == {"problem": "shaken"}:
-        other = {"problem": WindyCliffEnv(wind_strength=0.5).mdp}
+    other = OTHERS[other]()
     with pytest.raises(InputError, match="with these settings, or a new one"):
         erl_torch.train(**(arguments | other))
 
 
 # -- learners of one's own that a run cannot hold -------------------------------------------------------------
+
+
+def test_an_environment_without_a_model_is_known_by_its_arguments(tmp_path):
+    lakes = [gym.make("FrozenLake-v1", is_slippery=slippery) for slippery in (True, False)]
+    tuples = erl_torch.collect(lakes[0], 20, 50, seed=0)
+    erl_torch.train(SHORT, lakes[0], tuples, directory=tmp_path, evaluation=QUICK)
+    with pytest.raises(InputError, match=r"env\.kwargs\.is_slippery=False"):
+        erl_torch.train(SHORT, lakes[1], tuples, directory=tmp_path, evaluation=QUICK)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"learner": AlgorithmS1}, "must be a learner, as AlgorithmS1"),
+        ({"evaluation": {}}, "evaluation="),
+        ({"experience": "tuples.npz"}, "experience="),
+        ({"experience": Nothing()}, "experience="),
+    ],
+)
+def test_arguments_of_other_types_are_named(tmp_path, tuples, change, message):
+    arguments = {"learner": SHORT, "problem": MDP, "experience": tuples, "directory": tmp_path / "run"} | change
+    with pytest.raises(InputError, match=message):
+        erl_torch.train(**arguments)
 
 
 @dataclass(frozen=True)
@@ -200,8 +239,8 @@ class NotNamed(Counts):
 @pytest.mark.parametrize(
     ("learner", "message"),
     [
-        (Counts(first=Odd()), "learner=Counted: must be a learner whose states are of numbers.*a Odd has no place"),
-        (NotNamed(), r"learner=Counted: must be .*the classes in its states \(unknown class Counted"),
+        (Counts(first=Odd()), "learner=Counts: must be a learner whose states are of numbers.*a Odd has no place"),
+        (NotNamed(), r"learner=NotNamed: must be .*the classes in its states \(unknown class Counted"),
     ],
 )
 def test_what_no_checkpoint_can_hold_is_refused_at_the_start(tmp_path, tuples, learner, message):
@@ -225,8 +264,139 @@ def test_metrics_that_change_end_the_run_and_what_was_learnt_is_kept(tmp_path, t
     assert (result["status"], result["n_tuples"]) == ("stopped", len(tuples))
 
 
-def test_containers_numbers_and_arrays_come_back(tmp_path, tuples):
-    held = {"a": [1, 2.5, None, True, "x", (3,)], 4: np.arange(3.0), "t": torch.ones(2), "s": np.float32(1.5)}
-    learner = Counts(first=held)
-    erl_torch.train(learner, MDP, tuples, directory=tmp_path, evaluation=QUICK, checkpoint_every=0)
-    assert json.loads((tmp_path / "result.json").read_text())["status"] == "completed"
+class Kind(enum.Flag):
+    A = 1
+    B = 2
+
+
+@dataclass(frozen=True)
+class Kinds(Counts):
+    states: ClassVar[tuple[type, ...]] = (Counted, Kind)
+
+
+def test_containers_numbers_and_arrays_come_back_as_what_they_were(tmp_path, tuples, monkeypatch):
+    """Of the same types: arithmetic of single precision goes on in single precision."""
+    numbers = {"s": np.float32(1.5), "i": np.int8(3), "b": np.bool_(True), "kind": Kind.A | Kind.B}
+    held: dict[Any, Any] = {"a": [1, 2.5, None, True, "x", (3,)], 4: np.arange(3.0), "t": torch.ones(2), **numbers}
+    step = Counts.step
+    back: list[Any] = []
+
+    def stopping(self, state, stream):
+        back.append(state.more and state.more[0])
+        if len(back) == 3:
+            raise KeyboardInterrupt
+        return step(self, state, stream)
+
+    monkeypatch.setattr(Counts, "step", stopping)
+    arguments = {"directory": tmp_path, "evaluation": QUICK}
+    with pytest.raises(KeyboardInterrupt):
+        erl_torch.train(Kinds(second=[held]), MDP, tuples, **arguments)
+    erl_torch.train(Kinds(second=[held]), MDP, tuples, **arguments)
+    assert back[3].keys() == held.keys()
+    for key, value in held.items():
+        assert type(back[3][key]) is type(value)
+        if isinstance(value, np.ndarray | torch.Tensor):
+            assert (back[3][key] == value).all()
+        else:
+            assert back[3][key] == value
+    assert [type(item) for item in back[3]["a"]] == [type(item) for item in held["a"]]
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        collections.OrderedDict(a=1),
+        collections.Counter("ab"),
+        np.ma.masked_array([1.0, 2.0], [True, False]),
+        torch.ones(2, requires_grad=True),
+        np.longdouble(1),
+        {1, 2},
+        np.array(["a"], object),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_what_would_come_back_as_another_is_refused(tmp_path, tuples, value):
+    with pytest.raises(InputError, match="learner=Counts: must be a learner whose states are of"):
+        erl_torch.train(Counts(first=value), MDP, tuples, directory=tmp_path / "run", evaluation=QUICK)
+
+
+@pytest.mark.parametrize("lr_rho", [None, 0.01])
+def test_settings_of_any_kind_make_groups(tmp_path, tuples, lr_rho):
+    """Wherever they stand among the replicas; text and truth values too."""
+    learners = [
+        AlgorithmS1(beta, lr_rho=rate, n_epochs=1, n_bias=1, clip_rho=clip)
+        for beta, rate, clip in ((2.0, None, True), (5.0, lr_rho, True), (2.0, None, True), (5.0, lr_rho, False))
+    ]
+    replicas = Replicas(tuple(learners))
+    solution = erl_torch.train(replicas, MDP, tuples, directory=tmp_path, evaluation=QUICK)
+    result = json.loads((tmp_path / "result.json").read_text())
+    assert [group["replicas"] for group in result["groups"]] == [2, 1, 1]
+    assert [group["settings"]["clip_rho"] for group in result["groups"]] == [True, True, False]
+    assert [group["theta"]["mean"] for group in result["groups"]] == pytest.approx(
+        [(solution[0].theta + solution[2].theta) / 2, solution[1].theta, solution[3].theta], rel=1e-15
+    )
+    steps = [step for step, _ in scalars(tmp_path)["beta_2-clip_rho_True/theta_mean" if lr_rho is None else
+             "beta_2-lr_rho_None-clip_rho_True/theta_mean"]]  # fmt: skip
+    assert len(set(steps)) == len(steps)
+
+
+@dataclass(frozen=True)
+class array:
+    class_: int
+    arguments: int
+    of: int
+    late: int = field(init=False, default=0)
+
+    def __post_init__(self):
+        object.__setattr__(self, "late", self.late + self.of)
+        object.__setattr__(self, "of", self.of + 1)  # done twice, it is another
+
+
+@dataclass(frozen=True)
+class Strange(Counts):
+    states: ClassVar[tuple[type, ...]] = (Counted, array)
+
+
+def test_classes_of_a_state_come_back_as_they_were():
+    there = array(1, 2, 3)
+    back = decode(encode(there), (array,))
+    assert back == there
+    assert (back.late, back.of) == (3, 4)
+    check_state(Counted(0, 0, torch.ones(1, 1), there), Strange.states)
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    x: int
+
+
+@pytest.mark.parametrize(
+    "classes", [(Counted, Evaluation), (Counted, type("Counted", (Counted,), {}))], ids=["common", "own"]
+)
+def test_two_classes_of_one_name_are_refused(classes):
+    with pytest.raises(InputError, match="two classes are called"):
+        check_state(Counted(0, 0, torch.ones(1, 1)), classes)
+
+
+@pytest.mark.parametrize("epoch", [None, "one", 2**70, [1, "x"]])
+def test_metrics_of_the_start_are_numbers(tmp_path, tuples, monkeypatch, epoch):
+    monkeypatch.setattr(Counted, "metrics", lambda self: {"passes": epoch})
+    with pytest.raises(InputError, match="metrics of the learner, passes="):
+        erl_torch.train(Counts(), MDP, tuples, directory=tmp_path / "run", evaluation=QUICK)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_learner_that_fails_at_its_end_loses_nothing(tmp_path, tuples, monkeypatch):
+    """Mended, it goes on from what was learnt."""
+    solution = Counts.solution
+
+    def failing(self, state, history=(), failure=None):
+        raise ZeroDivisionError("in the last line")
+
+    monkeypatch.setattr(Counts, "solution", failing)
+    with pytest.raises(ZeroDivisionError):
+        erl_torch.train(Counts(), MDP, tuples, directory=tmp_path, evaluation=QUICK)
+    monkeypatch.setattr(Counts, "solution", solution)
+    monkeypatch.setattr(Counts, "step", None)  # nothing is left to learn
+    learnt = erl_torch.train(Counts(), MDP, tuples, directory=tmp_path, evaluation=QUICK)
+    assert learnt.n_steps == 3 * len(tuples)

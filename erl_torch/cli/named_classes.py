@@ -48,7 +48,7 @@ def paths(arguments: Sequence[str]) -> list[tuple[str, str]]:
     for argument in arguments:
         key, _, value = argument.lstrip("+").partition("=")
         group = re.split(r"[@.]", key)[0]
-        if group in GROUPS and (key in (group, f"{group}.class") or key.startswith(f"{group}@")):
+        if group in GROUPS and (key == group or key.endswith(".class") or key.startswith(f"{group}@")):
             names = (name.strip(" '\"") for name in value.split(","))
             found += [(group, name) for name in names if PATH.fullmatch(name)]
     return found

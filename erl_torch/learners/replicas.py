@@ -188,7 +188,7 @@ class Replicas(Together):
         state: Any = None,  # of the engine that runs
     ) -> Iterator[ReplicaState]:
         """Yield the state of all replicas after each epoch, from ``state`` on, until the last is done or has failed."""
-        self._check(experience, n_states, n_actions)
+        self.check(experience, n_states, n_actions)
         run = interleave if can_interleave(self, experience) else each
         return run(self, experience, n_states, n_actions, state)
 
@@ -249,7 +249,8 @@ class Replicas(Together):
             solutions.append(learner.solution(own, rows, state.failures.get(r, failure)))
         return ReplicaSolution(tuple(solutions), state.failures)
 
-    def _check(self, experience: ReplicaExperience, n_states: int, n_actions: int) -> None:
+    def check(self, experience: ReplicaExperience, n_states: int, n_actions: int) -> None:
+        """Raise InputError unless ``experience`` is what the replicas can learn from."""
         prior = self.prior_policy(n_states, n_actions)
         for r, learner in enumerate(self.learners):
             own = learner.prior_policy

@@ -18,7 +18,7 @@ from erl_torch.envs import ENTRY_POINTS
 from erl_torch.envs.discretise import Discretise
 from erl_torch.envs.estimate import estimate_mdp
 from erl_torch.experience.collect import COLUMN_BYTES
-from erl_torch.experience.experience import Experience
+from erl_torch.experience.experience import EXPERIENCE, Experience
 from erl_torch.experience.recording import FileRecording
 from erl_torch.experience.simulation import KEEP_BYTES, TUPLE_BYTES, ReplicaExperience
 from erl_torch.experience.sources import Source
@@ -110,7 +110,7 @@ def _env_class(keys: dict[str, Any]) -> tuple[type | None, str | EnvSpec]:
 
 def make_world(cfg: DictConfig, env: gym.Env[Any, Any], safe_point: SafePoint) -> World:
     """What there is to learn from in ``env``, as ``cfg`` says. Raises InputError."""
-    if "n_samples" in cfg:
+    if all(key in cfg for key in OF_THE_MODEL):
         return _control_world(cfg, env, safe_point)
     on_end = cfg.get("on_end", "restart")
     checks.one_of("env.on_end", on_end, ("restart", "absorb"))
@@ -226,6 +226,12 @@ def make_experience(source: Source, problem: Problem, seed: int, safe_point: Saf
     """
     with group("experience"), _collecting(source.work, source.n_tuples, safe_point) as report:
         data = source(problem, seed, report)
+        checks.instance("class", data, Experience, f"a source of {EXPERIENCE}")
+    return accepted(data)
+
+
+def accepted(data: Experience) -> tuple[Experience, int]:
+    """``data``, in memory where it is no longer than its chunk; bad tuples that were left out, which a note tells."""
     if not isinstance(data, FileRecording):
         return data, 0
     if data.n_skipped:

@@ -33,7 +33,7 @@ from erl_torch.learners.learner import NonFiniteError
 from erl_torch.log.event_file import PATTERN
 from erl_torch.solution import Solution, Status
 
-FORMAT = 2  # 1 knew no settings
+FORMAT = 3  # 1 knew no settings, 2 no types of NumPy's numbers
 KEPT = 2
 RESULTS = ("result.json", "solution.npz", "replicas.npz")
 FILES = ("settings.json", *RESULTS, "bands.png", "sweep.png")  # that a run writes under names of its own
@@ -50,20 +50,28 @@ class Checkpoints:
         settings: what the run computes with; a directory of other settings is refused.
         every: seconds between checkpoints; 0 is after every epoch, None is none but on a stop.
         device: where the tables of a checkpoint go.
+        key: what the directory is called in complaints.
 
     Raises:
         InputError: the directory holds a run of other settings; the first keys that differ are named. Or its
             ``settings.json`` is damaged.
     """
 
-    def __init__(self, directory: Path, settings: Mapping[str, Any], every: float | None, device: str = "cpu") -> None:
-        self.directory, self.every, self.device = directory, every, device
+    def __init__(
+        self,
+        directory: Path,
+        settings: Mapping[str, Any],
+        every: float | None,
+        device: str = "cpu",
+        key: str = "hydra.run.dir",
+    ) -> None:
+        self.directory, self.every, self.device, self.key = directory, every, device, key
         self._folder = directory / "checkpoints"
         self._settings = {key: value for key, value in _flat(settings).items() if key.split(".")[0] not in FREE}
         self._last = time.monotonic()
         for path in (*(directory / name for name in FILES), *self._folder.glob("*.ckpt")):
             if path.is_dir():
-                raise InputError("hydra.run.dir", directory, f"that of a run: {path} is a directory")
+                raise InputError(self.key, directory, f"that of a run: {path} is a directory")
         otherwise = "move it away: the checkpoints, if there are any, know their settings"
         before = read_json(directory / "settings.json", "settings", otherwise)
         self._ours = before is not None
@@ -134,7 +142,7 @@ class Checkpoints:
         there = [name for name in RESULTS if (self.directory / name).exists()]
         if there and not self._ours and not any(self._folder.glob("*.ckpt")):
             allowed = f"a new one, or that of a run: it holds a {there[0]} without the settings.json behind it"
-            raise InputError("hydra.run.dir", self.directory, allowed)
+            raise InputError(self.key, self.directory, allowed)
         otherwise = "move it away, and the run goes on from its checkpoint or begins again"
         found = read_json(self.directory / "result.json", "result", otherwise)
         if found is not None and not {"status", "objective", "seconds"} <= found.keys():
@@ -160,7 +168,7 @@ class Checkpoints:
             shown = ", ".join(f"{key}={self._settings.get(key)} (there: {before.get(key)})" for key in differ[:5])
             more = f" and {len(differ) - 5} more" if len(differ) > 5 else ""
             allowed = f"of a run with these settings, or a new one: not {shown}{more}"
-            raise InputError("hydra.run.dir", self.directory, allowed)
+            raise InputError(self.key, self.directory, allowed)
 
 
 def rows_of(found: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
@@ -174,44 +182,38 @@ def rows_of(found: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
 
 
 def encode(value: object) -> object:
-    """``value`` in containers, numbers, text and tensors; dataclasses and errors by the name of their class."""
-    if isinstance(value, np.ndarray):
-        return {"class": "array", "value": torch.from_numpy(np.ascontiguousarray(value))}
+    """``value`` in containers, numbers, text and tensors; dataclasses and errors by the name of their class.
+
+    ``decode`` gives back what was there, of the same types. Raises TypeError for a type that would not come back.
+    """
+    kind = type(value)
+    if value is None or kind in (bool, int, float, str):
+        return value
+    if kind is np.ndarray or isinstance(value, np.generic):
+        whole = np.asarray(value)  # torch keeps no dimension of 0 and strides of its own
+        return {"class": "array" if kind is np.ndarray else "scalar", "value": torch.from_numpy(whole.copy())}
+    if kind is torch.Tensor and isinstance(value, torch.Tensor) and not value.requires_grad:
+        return value.cpu()
     if is_dataclass(value) and not isinstance(value, type):
-        return {"class": type(value).__name__, **{f.name: encode(getattr(value, f.name)) for f in fields(value)}}
+        return {"class": kind.__name__, "fields": {f.name: encode(getattr(value, f.name)) for f in fields(value)}}
     if isinstance(value, ArithmeticError):
-        return {"class": type(value).__name__, "arguments": list(value.args)}
-    if isinstance(value, Mapping):
+        return {"class": kind.__name__, "arguments": [encode(item) for item in value.args]}
+    if isinstance(value, Enum):
+        return {"class": kind.__name__, "of": encode(value.value)}
+    if isinstance(value, dict) and kind is dict:
         return {"class": "dict", "items": [(encode(k), encode(v)) for k, v in value.items()]}
     if isinstance(value, tuple) and hasattr(value, "_asdict"):
-        return {"class": type(value).__name__, **{name: encode(item) for name, item in value._asdict().items()}}
-    if isinstance(value, tuple):
+        return {"class": kind.__name__, "named": {name: encode(item) for name, item in value._asdict().items()}}
+    if isinstance(value, tuple) and kind is tuple:
         return {"class": "tuple", "items": [encode(item) for item in value]}
-    if isinstance(value, list):
+    if isinstance(value, list) and kind is list:
         return [encode(item) for item in value]
-    if isinstance(value, np.generic):
-        return value.item()
-    if isinstance(value, Enum):
-        return {"class": type(value).__name__, "member": value.name}
-    if isinstance(value, torch.Tensor):
-        return value.detach().cpu()
-    if value is None or isinstance(value, (bool, int, float, str)):
-        return value
-    raise TypeError(f"a {type(value).__name__} has no place in a checkpoint")
-
-
-def check_state(state: object, classes: Iterable[type]) -> None:
-    """Raise InputError unless a checkpoint can hold ``state`` and give it back, being made of ``classes``."""
-    try:
-        decode(encode(state), (*COMMON, *classes))
-    except (TypeError, ValueError) as error:
-        allowed = "a learner whose states are of numbers, tensors, arrays, containers and the classes in its states"
-        raise InputError("learner", type(state).__name__, f"{allowed} ({error})") from error
+    raise TypeError(f"a {kind.__name__} has no place in a checkpoint")
 
 
 def decode(value: object, classes: Iterable[type], device: str = "cpu") -> Any:  # whatever was encoded
     """What ``encode`` was given. Raises ValueError for a class that is not one of ``classes``."""
-    by_name: dict[str, Any] = {one.__name__: one for one in classes}
+    by_name = _by_name(classes)
 
     def decoded(value: Any) -> Any:  # what torch.load gave: anything
         if isinstance(value, list):
@@ -220,22 +222,52 @@ def decode(value: object, classes: Iterable[type], device: str = "cpu") -> Any: 
             return value.to(device)
         if not isinstance(value, dict):
             return value
-        kind = value["class"]
-        if kind == "array":
-            return value["value"].numpy()
-        if kind == "dict":
-            return {decoded(k): decoded(v) for k, v in value["items"]}
-        if kind == "tuple":
-            return tuple(decoded(item) for item in value["items"])
+        kind, content = value.values()
+        form = next(form for form in value if form != "class")
+        if form == "value":
+            return content.numpy() if kind == "array" else content.numpy()[()]
+        if form == "items":
+            return {decoded(k): decoded(v) for k, v in content} if kind == "dict" else tuple(map(decoded, content))
         if kind not in by_name:
             raise ValueError(f"unknown class {kind}")
-        if "arguments" in value:
-            return by_name[kind](*value["arguments"])
-        if "member" in value:
-            return by_name[kind][value["member"]]
-        return by_name[kind](**{name: decoded(item) for name, item in value.items() if name != "class"})
+        if form in ("fields", "named"):
+            return _made(by_name[kind], form, {name: decoded(item) for name, item in content.items()})
+        return _made(by_name[kind], form, decoded(content))
 
     return decoded(value)
+
+
+def _by_name(classes: Iterable[type]) -> dict[str, Any]:
+    by_name: dict[str, Any] = {}
+    for one in classes:
+        if by_name.setdefault(one.__name__, one) is not one:
+            raise ValueError(f"two classes are called {one.__name__}")
+    return by_name
+
+
+def _made(kind: Any, form: str, content: Any) -> Any:  # of ``kind``, whatever that is
+    """An instance of ``kind`` as ``encode`` found it."""
+    if form == "arguments":
+        return kind(*content)
+    if form == "of":
+        return kind(content)
+    if form == "named":
+        return kind(**content)
+    new = object.__new__(kind)  # as it was: nothing is computed or checked anew
+    for name, item in content.items():
+        object.__setattr__(new, name, item)
+    return new
+
+
+def check_state(state: object, classes: Iterable[type], learner: str = "its learner") -> None:
+    """Raise InputError unless a checkpoint can hold ``state``, of ``learner``, as it is made of ``classes``."""
+    try:
+        decode(encode(state), (*COMMON, *classes))
+    except Exception as error:  # of classes that are not the package's
+        if out_of_memory(error):
+            raise
+        allowed = "a learner whose states are of numbers, tensors, arrays, containers and the classes in its states"
+        raise InputError("learner", learner, f"{allowed} ({error})") from error
 
 
 def _write(path: Path, settings: Mapping[str, Any], content: object) -> None:

@@ -11,8 +11,7 @@ from collections.abc import Mapping
 from dataclasses import MISSING, fields, is_dataclass
 from typing import Any
 
-from omegaconf import BooleanNode, DictConfig, FloatNode, IntegerNode, OmegaConf, StringNode, ValidationError
-from omegaconf.errors import UnsupportedValueType
+from omegaconf import BooleanNode, DictConfig, FloatNode, IntegerNode, StringNode, ValidationError
 
 from erl_torch.checks import InputError, out_of_memory
 from erl_torch.run.settings import KINDS
@@ -35,7 +34,7 @@ def resolve(path: object, key: str) -> type:
         raise InputError(key, path, allowed)
     try:
         found = getattr(importlib.import_module(module), name)
-    except Exception as error:  # of the import system, or whatever the module raises
+    except (Exception, SystemExit) as error:  # of the import system, or whatever the module raises
         if out_of_memory(error):
             raise
         raise InputError(key, path, f"{allowed} ({type(error).__name__}: {error})") from error
@@ -50,15 +49,20 @@ def is_own(path: object) -> bool:
 
 
 def foreign(cfg: DictConfig) -> dict[str, str]:
-    """The classes outside this package that ``cfg`` names, by key."""
-    paths = {f"{group}.class": cfg[group].get("class") for group in GROUPS if group in cfg}
+    """The classes outside this package that ``cfg`` names, by key: of its groups, and of each learner of several."""
+    nodes = {group: cfg[group] for group in GROUPS if group in cfg}
+    nodes |= {f"{group}.{name}": node[name] for group, node in nodes.items() for name in map(str, node)}
+    paths = {f"{key}.class": node.get("class") for key, node in nodes.items() if isinstance(node, DictConfig)}
     return {key: str(path) for key, path in paths.items() if path is not None and not is_own(path)}
 
 
 def parameters(kind: type) -> dict[str, inspect.Parameter]:
     """The arguments of ``kind`` that are settings, by name."""
     of_call = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
-    arguments = inspect.signature(kind).parameters.items()
+    try:
+        arguments = inspect.signature(kind).parameters.items()
+    except ValueError as error:  # some built-in classes tell none
+        raise InputError("class", kind.__name__, f"a class whose arguments Python can tell ({error})") from error
     return {name: one for name, one in arguments if name != "render_mode" and one.kind not in of_call}
 
 
@@ -79,11 +83,12 @@ def offered(group: str, path: str) -> dict[str, Any]:
 
 
 def _is_setting(value: object) -> bool:
-    try:
-        OmegaConf.create({"value": value})
-    except (UnsupportedValueType, ValidationError):
-        return False
-    return True
+    """Whether a configuration and ``settings.json`` can hold ``value``."""
+    if isinstance(value, (list, tuple)):
+        return all(map(_is_setting, value))
+    if isinstance(value, dict):
+        return all(isinstance(key, str) and _is_setting(item) for key, item in value.items())
+    return value is None or type(value) in (bool, int, float, str)
 
 
 def settings_of(values: Mapping[str, Any], kind: type, others: tuple[str, ...]) -> dict[str, Any]:

@@ -12,7 +12,7 @@ import numpy as np
 from erl_torch import checks, pictures
 from erl_torch.checks import InputError
 from erl_torch.learners.learner import StreamLearner
-from erl_torch.log.quantities import BANDS, PROGRESS, QUANTITIES, SWEEP, Quantity, tagged
+from erl_torch.log.quantities import BANDS, BY_NAME, PROGRESS, QUANTITIES, SWEEP, Quantity, tagged
 from erl_torch.log.tensorboard import Board
 
 LOGGED = ("mean", "median", "q25", "q75", "min", "max")
@@ -23,18 +23,23 @@ MOST_LOGGED = 24  # groups with curves of their own; all are in result.json and 
 class Group:
     """Replicas with the same settings."""
 
-    settings: Mapping[str, float]  # those that vary
-    members: slice  # of all replicas
+    settings: Mapping[str, Any]  # those that vary
+    members: slice | np.ndarray  # of all replicas
     beta: float
 
     @property
     def name(self) -> str:
         """As a part of tags: ``replicas``, or ``beta_2``."""
-        return "-".join(f"{key}_{value:g}" for key, value in self.settings.items()) or "replicas"
+        return "-".join(f"{key}_{setting_text(value)}" for key, value in self.settings.items()) or "replicas"
 
     @property
     def title(self) -> str:
-        return ", ".join(f"{key} {value:g}" for key, value in self.settings.items())
+        return ", ".join(f"{key} {setting_text(value)}" for key, value in self.settings.items())
+
+
+def setting_text(setting: object) -> str:
+    """A setting as a part of titles and tags."""
+    return f"{setting:g}" if checks.is_number(setting) else str(setting)
 
 
 def groups_of(vary: Mapping[str, Any], n_replicas: int, settings: Mapping[str, Any]) -> list[Group]:
@@ -68,14 +73,15 @@ def groups_of(vary: Mapping[str, Any], n_replicas: int, settings: Mapping[str, A
 
 
 def groups_among(learners: Sequence[StreamLearner[Any, Any]]) -> tuple[list[Group], dict[str, list[float]]]:
-    """Neighbours with the same settings; and the values of each number that varies, by its name."""
-    numbers = [{name: value for name, value in vars(one).items() if checks.is_number(value)} for one in learners]
-    names = [name for name in numbers[0] if any(row.get(name) != numbers[0][name] for row in numbers)]
-    settings = [{name: row[name] for name in names} for row in numbers]
-    starts = [r for r in range(len(learners)) if r == 0 or settings[r] != settings[r - 1]]
+    """Learners with the same settings, in order of their first; and the values of what varies, by name."""
+    values = [{name: value for name, value in vars(one).items() if name != "prior_policy"} for one in learners]
+    names = [name for name in values[0] if any(row[name] != values[0][name] for row in values)]
+    members: dict[tuple[Any, ...], list[int]] = {}
+    for r, row in enumerate(values):
+        members.setdefault(tuple(row[name] for name in names), []).append(r)
     groups = [
-        Group(settings[first], slice(first, last), float(learners[first].beta))
-        for first, last in zip(starts, [*starts[1:], len(learners)], strict=True)
+        Group(dict(zip(names, settings, strict=True)), np.array(rows), float(learners[rows[0]].beta))
+        for settings, rows in members.items()
     ]
     return groups, {name: list(dict.fromkeys(group.settings[name] for group in groups)) for name in names}
 
@@ -163,7 +169,7 @@ class Record:
     def curves(self) -> dict[str, list[pictures.BandLine]]:
         """For ``pictures.bands``: quantity -> one line per group."""
         shown: dict[str, list[pictures.BandLine]] = {}
-        for name in BANDS:
+        for name in [*BANDS, *(name for name in self.names if name not in BY_NAME)]:
             if name not in self.rows or (name == "return" and "reward_per_step" in self.rows):
                 continue
             lines = []
@@ -207,8 +213,14 @@ class Record:
         return tagged("Final", final)
 
     def sweep(self) -> tuple[str, dict[str, list[pictures.BandLine]]]:
-        """The first setting that varies, and quantity -> one line per combination of the others."""
-        key = next(iter(self.groups[0].settings))
+        """The first setting that varies in numbers, and quantity -> one line per combination of the others.
+
+        ("", {}) where there is none.
+        """
+        numbers = (k for k in self.groups[0].settings if all(checks.is_number(g.settings[k]) for g in self.groups))
+        key = next(numbers, "")
+        if not key:
+            return "", {}
         panels: dict[str, list[pictures.BandLine]] = {}
         for name in SWEEP:
             points: dict[str, list[tuple[float, dict[str, float], float | None]]] = {}
@@ -216,7 +228,7 @@ class Record:
             for group, optimum in sorted(pairs, key=lambda pair: pair[0].settings[key]):
                 row = self.statistics(group).get(name)
                 if row is not None:
-                    others = ", ".join(f"{k} {v:g}" for k, v in group.settings.items() if k != key)
+                    others = ", ".join(f"{k} {setting_text(v)}" for k, v in group.settings.items() if k != key)
                     points.setdefault(others, []).append((group.settings[key], row, optimum.get(name)))
             if points:
                 panels[name] = [pictures.BandLine(others, *zip(*row, strict=True)) for others, row in points.items()]

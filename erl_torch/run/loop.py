@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
+import torch
 from tqdm import tqdm
 
 from erl_torch.checks import InputError
@@ -129,8 +130,11 @@ class Run(Generic[S, E, A]):
         """
         saved, recorder, learner = self.saved, self.recorder, self.learner
         outcome = Outcome(learner.start(self.problem))
+        _checked(outcome.state.metrics(), [])
+        if not isinstance(outcome.state.policy, torch.Tensor):
+            raise InputError("policy of the learner", type(outcome.state.policy).__name__, "a torch.Tensor [S, A]")
         if not learner.needs_model:
-            check_state(outcome.state, learner.states)
+            check_state(outcome.state, learner.states, type(learner).__name__)
         checkpoint, began = saved.start(learner.states), self.began
         if checkpoint:
             if checkpoint["digest"] != self.digest:
@@ -149,8 +153,13 @@ class Run(Generic[S, E, A]):
                     board.texts(texts(self.configuration, saved.directory))
                 recorder.open(board, checkpoint is not None)
                 self._learn(outcome, checkpoint is not None, board, ended, began)
-                solution = learner.solution(outcome.state, outcome.history, outcome.stopped)
-                solution = recorder.finish(outcome, solution, board)
+                try:
+                    solution = learner.solution(outcome.state, outcome.history, outcome.stopped)
+                    solution = recorder.finish(outcome, solution, board)
+                except BaseException as error:
+                    if solution is None or not isinstance(error, Exception):  # else what there is is written below
+                        self._keep(outcome, board, ended, began)
+                    raise
                 if isinstance(outcome.stopped, NonFiniteError) or recorder.failed(solution) is not None:
                     board.failed()
         assert solution is not None
@@ -179,14 +188,7 @@ class Run(Generic[S, E, A]):
             return own | {"events": board.mark(), "recorder": recorder.mark()}
 
         def content() -> Content:
-            return recorder.content() | {
-                "state": outcome.state,
-                "history": columns(outcome.history),
-                "events": board.flush(),
-                "learning": outcome.seconds,
-                "seconds": time.perf_counter() - began,
-                "digest": self.digest,
-            }
+            return self._content(outcome, board, began)
 
         last = reached()
         try:
@@ -212,12 +214,28 @@ class Run(Generic[S, E, A]):
             outcome.stopped, outcome.state = error, last["state"]
             del outcome.history[last["n"] :]
             recorder.back(last["recorder"])
-            nothing_learnt = not outcome.history
-            if nothing_learnt and not isinstance(error, (NonFiniteError, KeyboardInterrupt, SystemExit)):
+            if not outcome.history and not isinstance(error, (NonFiniteError, KeyboardInterrupt, SystemExit)):
                 raise
-            if not (learner.needs_model or nothing_learnt or isinstance(error, NonFiniteError)):
+            if not isinstance(error, NonFiniteError):
                 at = {"events": last["events"], "learning": last["learning"]}
-                ended.keep(self.saved, learner.position(outcome.state), lambda: content() | at)
+                self._keep(outcome, board, ended, began, at)
+
+    def _content(self, outcome: Outcome[S], board: Board, began: float) -> Content:
+        """What a checkpoint keeps."""
+        return self.recorder.content() | {
+            "state": outcome.state,
+            "history": columns(outcome.history),
+            "events": board.flush(),
+            "learning": outcome.seconds,
+            "seconds": time.perf_counter() - began,
+            "digest": self.digest,
+        }
+
+    def _keep(self, outcome: Outcome[S], board: Board, ended: Ended, began: float, at: Content | None = None) -> None:
+        """A checkpoint of what is learnt, if anything is; ``at`` is what belongs to its epoch."""
+        if outcome.history and not self.learner.needs_model:
+            step = self.learner.position(outcome.state)
+            ended.keep(self.saved, step, lambda: self._content(outcome, board, began) | (at or {}))
 
     def _bar(self) -> tqdm:
         total = self.learner.total(self.experience)

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from erl_torch import pictures
+from erl_torch import checks, pictures
 from erl_torch.empirical import reservations
 from erl_torch.empirical.reservations import Counted, Reservation
 from erl_torch.empirical.uncertainty import Estimate
@@ -22,20 +22,21 @@ from erl_torch.experience.transitions import Transitions
 from erl_torch.files import write_png
 from erl_torch.learners.learner import NonFiniteError, StreamLearner
 from erl_torch.learners.replicas import Replicas, ReplicaSolution, ReplicaState
-from erl_torch.log.quantities import BY_NAME, with_own
+from erl_torch.log.quantities import with_own
 from erl_torch.log.tensorboard import Board, Boards, replica_layout
 from erl_torch.mdp.tabular import TabularMDP, check_policy
 from erl_torch.notes import note
 from erl_torch.problem import Problem
 from erl_torch.rng import streams
 from erl_torch.run.checkpoint import Content
-from erl_torch.run.groups import MOST_LOGGED, Group, Record, statistics
+from erl_torch.run.groups import MOST_LOGGED, Group, Record, setting_text, statistics
 from erl_torch.run.judge import SMALL, EvaluationSettings, episode_model, judging_model, of_data
 from erl_torch.run.loop import Outcome, Row, SafePoint
 from erl_torch.run.report import Title, ended_as, last_rows, plural, versions
 from erl_torch.solution import Status
 from erl_torch.solvers import solve_soft_bellman
 
+MOST_LETTERS = 64  # of a setting that is text, in ``replicas.npz``
 FEW = 24  # replicas whose simulated streams are sampled once more, to hold theta against what they say
 
 
@@ -142,15 +143,16 @@ class ReplicaRecorder:
         per_setting = " of each setting" if len(self.groups) > 1 else ""
         title = f"{self.title.env}, {self.title.learner}: {plural(self._n_each, 'replica')}{per_setting}"
         drawn = [("bands", self.recorded.curves(), "tuples streamed, each replica", title)]
-        if self.vary:
-            key, panels = self.recorded.sweep()
+        key, panels = self.recorded.sweep()
+        if key:
             drawn.append(("sweep", panels, key, f"{title}, at the end"))
+        axes = {one.name: one.axis for one in with_own(self.replicas.learners[0].quantities)}
         for name, panels, x_label, heading in drawn:
             markers = name == "sweep"
-            whole = pictures.bands({BY_NAME[k].axis: v for k, v in panels.items()}, x_label, heading, markers)
+            whole = pictures.bands({axes[k]: v for k, v in panels.items()}, x_label, heading, markers)
             write_png(board.directory / f"{name}.png", whole)
             for k, lines in panels.items():  # on TensorBoard's small cards one panel can be read
-                card = pictures.bands({BY_NAME[k].axis: lines}, x_label, heading, markers, card=True)
+                card = pictures.bands({axes[k]: lines}, x_label, heading, markers, card=True)
                 board.picture(f"{name}/{k}", card, step)
         rate = outcome.state.work / max(outcome.seconds, 1e-9)
         board.scalars({"time/tuples_per_second": rate}, step)
@@ -161,8 +163,8 @@ class ReplicaRecorder:
 
     @property
     def _n_each(self) -> int:
-        """Replicas of each group."""
-        return len(self.replicas) // len(self.groups)
+        """Replicas of each group, at most."""
+        return max(len(np.arange(len(self.replicas))[group.members]) for group in self.groups)
 
     def _outcomes(self, solution: ReplicaSolution) -> list[list[Reservation]]:
         """How each replica ended, and what its theta shows."""
@@ -175,10 +177,13 @@ class ReplicaRecorder:
         ]
 
     def save(self, solution: ReplicaSolution, directory: Path) -> None:
-        varied = {f"vary/{key}": np.empty(len(self.replicas)) for key in self.groups[0].settings}
-        for group in self.groups:
-            for key, value in group.settings.items():
-                varied[f"vary/{key}"][group.members] = value
+        varied = {}
+        for key in self.groups[0].settings:
+            own = [group.settings[key] for group in self.groups]
+            column = np.empty(len(self.replicas), None if all(map(checks.is_number, own)) else f"U{MOST_LETTERS}")
+            for group, value in zip(self.groups, own, strict=True):
+                column[group.members] = value if column.dtype.kind == "f" else setting_text(value)
+            varied[f"vary/{key}"] = column
         more = self.recorded.arrays() | {"seed": np.array(self.seeds)} | varied
         solution.save(directory / "replicas.npz", more)
 
@@ -418,7 +423,7 @@ def _many_groups(first: str, seeds: str, groups: Sequence[Group], result: Mappin
             yield "..."
             continue
         theta, objective, best = found.get("theta"), found.get("objective"), found["exact"]
-        title = ", ".join(f"{key} {value:g}" for key, value in found["settings"].items())
+        title = ", ".join(f"{key} {setting_text(value)}" for key, value in found["settings"].items())
         cells = [
             f"{theta['mean']:.6g}" if theta else "-",
             f"{theta['q25']:.5g} to {theta['q75']:.5g}" if theta else "-",

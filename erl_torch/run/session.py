@@ -19,11 +19,13 @@ import yaml
 from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.envs.tabular import TabularEnv
-from erl_torch.experience.experience import Experience
+from erl_torch.experience.experience import EXPERIENCE, Experience
 from erl_torch.experience.simulation import ReplicaExperience, Simulation, streams_of
 from erl_torch.experience.sources import Source
 from erl_torch.experience.transitions import Transitions
-from erl_torch.learners.learner import Table, TabularLearner
+from erl_torch.files import alone
+from erl_torch.learners.exact import Exact
+from erl_torch.learners.learner import StreamLearner, Table, TabularLearner
 from erl_torch.learners.replicas import Replicas, ReplicaSolution
 from erl_torch.log.tensorboard import hyperparameters
 from erl_torch.mdp.from_gymnasium import known_mdp, sizes
@@ -31,6 +33,7 @@ from erl_torch.mdp.tabular import TabularMDP, check_policy
 from erl_torch.notes import Note, collected
 from erl_torch.problem import Problem
 from erl_torch.rng import streams
+from erl_torch.run.build import accepted
 from erl_torch.run.checkpoint import Checkpoints
 from erl_torch.run.groups import groups_among
 from erl_torch.run.judge import EvaluationSettings
@@ -40,6 +43,7 @@ from erl_torch.run.report import Title
 from erl_torch.run.single import SingleRecorder
 from erl_torch.solution import Solution
 
+KINDS = (Simulation, list, tuple)  # of experience that replicas take besides
 Given = Problem | TabularMDP | gym.Env[Any, Any]
 
 
@@ -85,13 +89,19 @@ def train(
     """Learn in ``directory``: with TensorBoard's boards, checkpoints, ``result.json`` and the solution's file.
 
     The run of the command line, without its configuration. Called again after a stop or a crash, it goes on from the
-    last checkpoint, bit for bit; a run that is complete is read. Nothing is printed and no global setting is changed,
-    unless ``talks``; notes are warnings of class ``Note``, once the run is written.
+    last checkpoint, bit for bit; a run that is complete is read. Nothing is printed, but for a warning where a file of
+    the run is damaged, and no global setting is changed, unless ``talks``. Notes are warnings of class ``Note``, once
+    the run is written.
+
+    What a run is of, is the learner and its settings, the tuples, the model where it is known, and what Gymnasium knows
+    of the environment; a directory of another run is refused. Of an environment that was not made by ``gymnasium.make``
+    and has no model only the class is known. Two runs at once in one process need processes, not threads.
 
     Args:
         learner: one learner, an exact solver, or ``Replicas``.
         problem: an environment of Gymnasium's with finite spaces, a model, or a ``Problem`` of both. Where the model is
-            known, policies are evaluated on it and the solution is certified.
+            known, policies are evaluated on it and the solution is certified; of an environment with a table ``P`` give
+            ``tabular_mdp(env)``. Of a ``Problem`` its own horizon counts.
         experience: tuples to learn from, or a ``Source`` of them; of ``Replicas`` also one stream per replica, or a
             ``Simulation``. None of an exact solver.
         directory: of the run; made if it is missing.
@@ -107,21 +117,14 @@ def train(
     """
     began = time.perf_counter()
     seed = checks.at_least("seed", seed, 0)
-    if checkpoint_every is not None and not (checks.is_number(checkpoint_every) and checkpoint_every >= 0):
-        raise InputError("checkpoint_every", checkpoint_every, "seconds >= 0, or None")
-    settings = evaluation or EvaluationSettings()
+    settings = EvaluationSettings() if evaluation is None else evaluation
+    one = _checked(learner, experience, settings, checkpoint_every)
     many = isinstance(learner, Replicas)
-    one = learner.learners[0] if many else learner
-    for method in ("start", "run", "solution"):
-        if not callable(getattr(one, method, None)):
-            raise InputError("learner", type(one).__name__, f"a learner, as AlgorithmS1(): it has no method {method}")
     given = _problem(problem, one.prior_policy, settings.horizon)
-    if learner.needs_model != (experience is None):
-        allowed = "None: the learner solves the model" if learner.needs_model else "given: tuples, or a source of them"
-        raise InputError("experience", type(experience).__name__, allowed)
     learner.start(given)  # raises where the learner cannot learn this problem
-    described = _described(learner, given, experience, seed, settings)
-    saved = Checkpoints(Path(directory), described, checkpoint_every, getattr(one, "device", "cpu"))
+    digest = None if isinstance(experience, Source) else _digest(experience)
+    described = _described(learner, given, experience, seed, settings) | {"digest": digest}
+    saved = Checkpoints(Path(directory), described, checkpoint_every, getattr(one, "device", "cpu"), "directory")
     if saved.result() is not None:
         saved.clear()
         kind, name = (ReplicaSolution, "replicas.npz") if many else (Solution, "solution.npz")
@@ -131,19 +134,25 @@ def train(
         recorder: Any
         if many:
             experience, seeds = _of_replicas(learner, given, experience, seed)
+            learner.check(experience, given.n_states, given.n_actions)
             groups, vary = groups_among(learner.learners)
             recorder = ReplicaRecorder(learner, given, experience, groups, seeds, vary, settings, title, lambda: None)
             n_experience = recorder.n_experience
         else:
             if isinstance(experience, Source):
                 experience = experience(given, seed, lambda _: None)
-            recorder = SingleRecorder(learner, given, experience, settings, streams(seed).evaluation, title)
+                checks.instance("experience", experience, Experience, EXPERIENCE)
+            n_skipped = 0
+            if experience is not None:
+                experience, n_skipped = accepted(experience)
+            rng = streams(seed).evaluation
+            recorder = SingleRecorder(learner, given, experience, settings, rng, title, n_skipped)
             n_experience = 0 if experience is None else len(experience)
         run: Run[Any, Any, Any] = Run(
             learner=learner,
             problem=given,
             experience=experience,
-            digest=_digest(experience),
+            digest=_digest(experience) if digest is None else digest,
             recorder=recorder,
             saved=saved,
             hyperparameters=hyperparameters(described, n_experience=n_experience),
@@ -153,11 +162,47 @@ def train(
             safe_point=lambda: None,
             began=began,
         )
-        solution, _ = run.perform(notes)
+        made = not saved.directory.exists()
+        saved.directory.mkdir(parents=True, exist_ok=True)
+        try:
+            with alone(saved.directory, "directory"):
+                solution, _ = run.perform(notes)
+        finally:
+            if made and not any(saved.directory.iterdir()):
+                saved.directory.rmdir()
     if not talks:
         for text in notes:
             warnings.warn(text, Note, stacklevel=2)
     return solution
+
+
+def _checked(
+    learner: Any, experience: object, settings: EvaluationSettings, checkpoint_every: float | None
+) -> StreamLearner[Any, Any] | Exact:
+    """The learner, or the first of replicas. Raises InputError for arguments of ``train`` that cannot be used."""
+    if checkpoint_every is not None and not (checks.is_number(checkpoint_every) and checkpoint_every >= 0):
+        raise InputError("checkpoint_every", checkpoint_every, "seconds >= 0, or None")
+    checks.instance("evaluation", settings, EvaluationSettings, "EvaluationSettings, or None")
+    many = isinstance(learner, Replicas)
+    one = learner.learners[0] if many else learner
+    if not isinstance(one, (StreamLearner, Exact)) or not is_dataclass(one):
+        raise InputError("learner", learner, "a learner, as AlgorithmS1(): a dataclass derived from StreamLearner")
+    for name in ("beta", "prior_policy"):
+        if not hasattr(one, name):
+            raise InputError("learner", type(one).__name__, f"one that has the field {name}")
+    if learner.needs_model != (experience is None):
+        allowed = "None: the learner solves the model" if learner.needs_model else "given: tuples, or a source of them"
+        raise InputError("experience", type(experience).__name__, allowed)
+    if isinstance(experience, Source):
+        if not is_dataclass(experience):
+            raise InputError("experience", experience, "a source that is a dataclass")
+    elif many and isinstance(experience, KINDS):
+        streams_given = () if isinstance(experience, Simulation) else experience
+        for data in streams_given:
+            checks.instance("experience", data, Transitions, "Transitions, one per replica")
+    elif experience is not None:
+        checks.instance("experience", experience, Experience, EXPERIENCE)
+    return one
 
 
 def _problem(given: Given, prior_policy: Table, horizon: int) -> Problem:
@@ -186,7 +231,7 @@ def _of_replicas(
         return experience, seeds
     if (simulation := experience.simulation(problem, seeds, None)) is not None:
         return simulation, seeds
-    recorded = [experience(problem, one, lambda _: None) for one in seeds]
+    recorded = [accepted(experience(problem, one, lambda _: None))[0] for one in seeds]
     held = [data for data in recorded if isinstance(data, Transitions)]
     if len(held) < len(recorded):
         raise InputError("experience", type(experience).__name__, "a source of tuples in memory, for replicas")
@@ -219,16 +264,26 @@ def _described(
         values = {"n_replicas": len(learner), **values}
     else:
         name, values = type(learner).__name__, _plain(learner)
-    source = {"name": type(experience).__name__}
+    source = {"name": type(experience).__name__, "module": type(experience).__module__}
     if isinstance(experience, (Source, Simulation)):
         source |= _plain(experience)
+    one = learner.learners[0] if isinstance(learner, Replicas) else learner
+    models = {key: _plain(getattr(problem, key)) for key in ("mdp", "episode", "horizon", "prior")}
+    models["source"] = _plain(problem.source) if isinstance(problem.source, TabularMDP) else None
     return {
-        "env": {"name": problem.name, "model": None if problem.mdp is None else _plain(problem.mdp)},
-        "learner": {"name": name, **values},
+        "env": {"name": problem.name, **models, **_environment(problem.env)},
+        "learner": {"name": name, "module": type(one).__module__, **values},
         "experience": source,
         "evaluation": asdict(settings),
         "seed": seed,
     }
+
+
+def _environment(env: gym.Env[Any, Any]) -> dict[str, Any]:
+    """Class, id and arguments, as far as Gymnasium knows them."""
+    kind = type(env.unwrapped)
+    spec = {} if env.spec is None else {"id": env.spec.id, "kwargs": _plain(env.spec.kwargs)}
+    return {"environment": f"{kind.__module__}.{kind.__qualname__}", **spec}
 
 
 def _plain(value: object) -> Any:  # what YAML and JSON hold
@@ -242,14 +297,17 @@ def _plain(value: object) -> Any:  # what YAML and JSON hold
     if isinstance(value, np.ndarray):
         return f"array {list(value.shape)}, {_sha256((value,))}"
     if isinstance(value, np.generic):
-        return value.item()
+        value = value.item()
     if is_dataclass(value) and not isinstance(value, type):
         return {f.name: _plain(getattr(value, f.name)) for f in fields(value)}
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple, range)):
         return [_plain(item) for item in value]
-    return value if value is None or isinstance(value, (bool, int, float, str)) else repr(value)
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    named: Any = value if callable(value) else type(value)
+    return f"{getattr(named, '__module__', '')}.{getattr(named, '__qualname__', type(value).__qualname__)}"
 
 
 def _sha256(arrays: Sequence[np.ndarray]) -> str:
