@@ -221,7 +221,7 @@ class Replicas(Together):
         if experience is None:
             return None
         longest = experience.n_tuples if isinstance(experience, Simulation) else max(map(len, streams_of(experience)))
-        return self.learners[0].passes * longest * len(self)
+        return longest * sum(learner.passes for learner in self.learners)
 
     def milestone(self, state: ReplicaState) -> str:
         """That of the replicas that reached one in the last epoch; of several, the furthest's."""

@@ -172,7 +172,7 @@ class Checkpoints:
 
 
 def rows_of(found: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
-    """What ``fitting.columns`` was given: numbers as numbers, arrays as arrays."""
+    """What ``erl_torch.learners.learner.columns`` was given: numbers as numbers, arrays as arrays."""
     n = max((len(column) for column in found.values()), default=0)
     plain = {name: column.tolist() if column.ndim == 1 else list(column) for name, column in found.items()}
     return [{name: column[i] for name, column in plain.items()} for i in range(n)]

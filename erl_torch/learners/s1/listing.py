@@ -1,4 +1,4 @@
-"""Algorithm S1's inner loops as the listing has them: the slow twins of ``erl_torch.kernels``.
+"""Algorithm S1's inner loops as the listing has them: the slow twins of the kernels beside it.
 
 One tuple at a time, direct form, nothing rearranged. Tables are anything indexed as ``u[s, a]``: torch
 tensors on any device, or NumPy views of them (thirty times faster on the CPU, same doubles).
