@@ -1404,7 +1404,7 @@ MUTANTS = [
         "a box's distribution is big-endian",
         "envs/discretise.py",
         "np.outer(marginal, p).ravel()",
-        "np.outer(p, one).ravel()",
+        "np.outer(p, marginal).ravel()",
         "test_discretise.py::test_distribution_of_a_box",
     ),
     Mutant(
@@ -1674,7 +1674,7 @@ MUTANTS = [
         "the successor hidden at the low end is the best",
         "empirical/uncertainty.py",
         "_with_successor(model, empirical, rows, sign * here.value)",
-        "_with_successor(model, part, rows, here.value)",
+        "_with_successor(model, empirical, rows, here.value)",
         "test_interval_rules.py::test_a_row_hides_what_another_action_has_shown_on_either_side",
     ),
     Mutant(
