@@ -400,3 +400,19 @@ def test_a_learner_that_fails_at_its_end_loses_nothing(tmp_path, tuples, monkeyp
     monkeypatch.setattr(Counts, "step", None)  # nothing is left to learn
     learnt = erl_torch.train(Counts(), MDP, tuples, directory=tmp_path, evaluation=QUICK)
     assert learnt.n_steps == 3 * len(tuples)
+
+
+def test_episodes_end_at_the_environments_own_limit(tmp_path):
+    """FrozenLake's are of 100 steps: figures over more would be of another problem."""
+    lake = gym.make("FrozenLake-v1")
+    tuples = erl_torch.collect(lake, 20, 50, seed=0)
+    erl_torch.train(SHORT, lake, tuples, directory=tmp_path, evaluation=QUICK)
+    assert json.loads((tmp_path / "settings.json").read_text())["env.horizon"] == lake.spec.max_episode_steps == 100
+
+
+def test_streams_in_another_order_are_another_run(tmp_path, tuples):
+    streams = [tuples, erl_torch.collect(MDP, 20, 200, seed=1)]
+    replicas = Replicas.of(SHORT, 2)
+    erl_torch.train(replicas, MDP, streams, directory=tmp_path, evaluation=QUICK)
+    with pytest.raises(InputError, match="with these settings, or a new one: not digest="):
+        erl_torch.train(replicas, MDP, streams[::-1], directory=tmp_path, evaluation=QUICK)
