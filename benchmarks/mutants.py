@@ -1924,10 +1924,10 @@ MUTANTS = [
         "test_session.py::test_what_no_checkpoint_can_hold_is_refused_at_the_start",
     ),
     Mutant(
-        "replicas of a temperature are a group each",
+        "settings vary where the second replica differs",
         "run/groups.py",
-        "if r == 0 or settings[r] != settings[r - 1]",
-        "if True",
+        "any(row[name] != values[0][name] for row in values)",
+        "any(row[name] != values[0][name] for row in values[:2])",
         "test_session.py::test_replicas_of_two_temperatures",
     ),
     Mutant(
