@@ -95,6 +95,13 @@ def events(directory: Path) -> EventAccumulator:
     return EventAccumulator(str(directory), size_guidance={"images": 0, "scalars": 0, "tensors": 0}).Reload()
 
 
+def scalars(directory: Path) -> dict[str, list[tuple[int, float]]]:
+    """Every record but the times: tag -> [(step, value)]."""
+    reader = events(directory)
+    tags = [tag for tag in reader.Tags()["scalars"] if not tag.startswith("time/")]
+    return {tag: [(e.step, e.value) for e in reader.Scalars(tag)] for tag in tags}
+
+
 DOCUMENTED = set(re.findall(r"`([\w/]+)`", (ROOT / "docs" / "logging.md").read_text()))
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from helpers import composed, events, random_mdp
+from helpers import composed, events, random_mdp, scalars
 
 from erl_torch import AlgorithmS1, InputError, NonFiniteError, Replicas, Simulation, Solution, Status, collect
 from erl_torch.learners import LEARNERS
@@ -42,13 +42,6 @@ def after(calls, error):
             raise error
 
     return safe_point
-
-
-def scalars(directory):
-    """Every record but the times: tag -> [(step, value)]."""
-    reader = events(directory)
-    tags = [tag for tag in reader.Tags()["scalars"] if not tag.startswith("time/")]
-    return {tag: [(e.step, e.value) for e in reader.Scalars(tag)] for tag in tags}
 
 
 def names(directory):

@@ -11,7 +11,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from helpers import composed, events
+from helpers import composed, scalars
 
 import erl_torch
 from erl_torch import AlgorithmS1, EvaluationSettings, InputError, Note, Replicas, Simulation, StreamLearner
@@ -31,12 +31,6 @@ pytestmark = pytest.mark.filterwarnings("ignore::erl_torch.Note")
 @pytest.fixture
 def tuples():
     return erl_torch.collect(MDP, 20, 200, seed=0)
-
-
-def scalars(directory):
-    reader = events(directory)
-    tags = [tag for tag in reader.Tags()["scalars"] if not tag.startswith("time/")]
-    return {tag: [(e.step, e.value) for e in reader.Scalars(tag)] for tag in tags}
 
 
 def test_it_is_the_run_of_the_command_line(tmp_path, capfd):

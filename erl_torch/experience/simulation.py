@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from erl_torch import checks
 from erl_torch.experience.collect import collect
+from erl_torch.experience.experience import Experience
 from erl_torch.experience.transitions import Transitions
 from erl_torch.mdp.tabular import TabularMDP, check_policy
 
@@ -71,6 +72,20 @@ def streams_of(experience: Transitions | Sequence[Transitions]) -> Sequence[Tran
     return [experience] if isinstance(experience, Transitions) else experience
 
 
+def longest(experience: ReplicaExperience) -> int:
+    """Tuples of the longest stream."""
+    return experience.n_tuples if isinstance(experience, Simulation) else max(map(len, streams_of(experience)))
+
+
+def digest(experience: Experience | ReplicaExperience | None) -> object:
+    """The checksum of a stream, or of each; None of a simulation, whose settings tell all, or of nothing."""
+    if experience is None or isinstance(experience, Simulation):
+        return None
+    if isinstance(experience, Sequence):
+        return [data.checksum() for data in experience]
+    return experience.checksum()
+
+
 def tuples_of(experience: ReplicaExperience, r: int, prior: np.ndarray) -> Transitions:
     """The stream of one replica."""
     if isinstance(experience, Transitions):
@@ -80,10 +95,6 @@ def tuples_of(experience: ReplicaExperience, r: int, prior: np.ndarray) -> Trans
 
 def fits(experience: ReplicaExperience, n_replicas: int, tuple_bytes: int) -> bool:
     """Whether the tuples of all replicas are to be kept, at so many bytes each."""
-    if isinstance(experience, Simulation):
-        n_tuples = experience.n_tuples
-        if experience.keep is not None:
-            return bool(experience.keep)
-    else:
-        n_tuples = max(map(len, streams_of(experience)))
-    return n_tuples * n_replicas * tuple_bytes <= KEEP_BYTES
+    if isinstance(experience, Simulation) and experience.keep is not None:
+        return bool(experience.keep)
+    return longest(experience) * n_replicas * tuple_bytes <= KEEP_BYTES

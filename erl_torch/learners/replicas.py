@@ -32,7 +32,7 @@ import torch
 
 from erl_torch import checks
 from erl_torch.checks import InputError
-from erl_torch.experience.simulation import ReplicaExperience, Simulation, fits, streams_of, tuples_of
+from erl_torch.experience.simulation import ReplicaExperience, Simulation, fits, longest, tuples_of
 from erl_torch.experience.transitions import Transitions
 from erl_torch.files import read_npz, write_npz
 from erl_torch.learners.learner import NonFiniteError, StreamLearner, StreamState, columns
@@ -199,7 +199,15 @@ class Replicas(Together):
 
     def start(self, problem: Problem) -> EachState:
         """The state of all before any tuple. Raises InputError as each learner does."""
-        return EachState(tuple(learner.start(problem) for learner in self.learners), {})
+        states: list[StreamState] = []
+        before: list[object] = []
+        for learner in self.learners:
+            settings = [*vars(learner).values()]
+            # A state is a value: neighbours of the same settings share theirs.
+            same = states and all(one is other for one, other in zip(settings, before, strict=True))
+            states.append(states[-1] if same else learner.start(problem))
+            before = settings
+        return EachState(tuple(states), {})
 
     def run(
         self, problem: Problem, experience: ReplicaExperience | None, state: ReplicaState | None = None
@@ -220,8 +228,7 @@ class Replicas(Together):
         """Tuples to stream, at most, in all replicas together."""
         if experience is None:
             return None
-        longest = experience.n_tuples if isinstance(experience, Simulation) else max(map(len, streams_of(experience)))
-        return longest * sum(learner.passes for learner in self.learners)
+        return longest(experience) * sum(learner.passes for learner in self.learners)
 
     def milestone(self, state: ReplicaState) -> str:
         """That of the replicas that reached one in the last epoch; of several, the furthest's."""

@@ -162,8 +162,13 @@ def _control_world(cfg: DictConfig, env: gym.Env[Any, Any], safe_point: SafePoin
 def make_problem(cfg: DictConfig, env: gym.Env[Any, Any], world: World, learner: TabularLearner[Any]) -> Problem:
     """What there is to learn in ``env`` as the run ``cfg`` says, with the prior of ``learner``. Raises InputError."""
     prior = check_policy("learner.prior_policy", learner.prior_policy, *sizes(env))
-    horizon = min(cfg.evaluation.horizon, (env.spec and env.spec.max_episode_steps) or cfg.evaluation.horizon)
+    horizon = steps_of(env, cfg.evaluation.horizon)
     return Problem(env, world.source, prior, world.mdp, world.episode, horizon, cfg.env.name)
+
+
+def steps_of(env: gym.Env[Any, Any], horizon: int) -> int:
+    """Steps of an episode of ``env``, at most ``horizon``."""
+    return min(horizon, (env.spec and env.spec.max_episode_steps) or horizon)
 
 
 def learner_class(cfg: DictConfig, key: str = "learner") -> type:

@@ -190,8 +190,8 @@ def encode(value: object) -> object:
     if value is None or kind in (bool, int, float, str):
         return value
     if kind is np.ndarray or isinstance(value, np.generic):
-        whole = np.asarray(value)  # torch keeps no dimension of 0 and strides of its own
-        return {"class": "array" if kind is np.ndarray else "scalar", "value": torch.from_numpy(whole.copy())}
+        whole = np.require(value, requirements=("C", "W"))  # as torch takes it
+        return {"class": "array" if kind is np.ndarray else "scalar", "value": torch.from_numpy(whole)}
     if kind is torch.Tensor and isinstance(value, torch.Tensor) and not value.requires_grad:
         return value.cpu()
     if is_dataclass(value) and not isinstance(value, type):

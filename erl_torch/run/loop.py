@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
-import torch
 from tqdm import tqdm
 
 from erl_torch.checks import InputError
@@ -131,8 +130,6 @@ class Run(Generic[S, E, A]):
         saved, recorder, learner = self.saved, self.recorder, self.learner
         outcome = Outcome(learner.start(self.problem))
         _checked(outcome.state.metrics(), [])
-        if not isinstance(outcome.state.policy, torch.Tensor):
-            raise InputError("policy of the learner", type(outcome.state.policy).__name__, "a torch.Tensor [S, A]")
         if not learner.needs_model:
             check_state(outcome.state, learner.states, type(learner).__name__)
         checkpoint, began = saved.start(learner.states), self.began

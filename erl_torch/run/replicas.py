@@ -17,7 +17,7 @@ from erl_torch.empirical.reservations import Counted, Reservation
 from erl_torch.empirical.uncertainty import Estimate
 from erl_torch.evaluation import Judge, evaluate
 from erl_torch.experience.collect import COLUMN_BYTES
-from erl_torch.experience.simulation import KEEP_BYTES, ReplicaExperience, Simulation
+from erl_torch.experience.simulation import KEEP_BYTES, ReplicaExperience, Simulation, longest
 from erl_torch.experience.transitions import Transitions
 from erl_torch.files import write_png
 from erl_torch.learners.learner import NonFiniteError, StreamLearner
@@ -89,13 +89,6 @@ class ReplicaRecorder:
             return {}
         figures = {"theta": optimum.theta, "delta_max": optimum.reward_bias_max, "objective": -optimum.theta}
         return figures | self.judges.rewards(optimum.policy.numpy())
-
-    @property
-    def n_experience(self) -> int:
-        """Tuples of the longest stream."""
-        if isinstance(self.experience, Simulation):
-            return self.experience.n_tuples
-        return len(self.experience) if isinstance(self.experience, Transitions) else max(map(len, self.experience))
 
     # -- records --------------------------------------------------------------------------------------
 
@@ -216,7 +209,7 @@ class ReplicaRecorder:
                 for group, optimum, row in zip(self.groups, self.optima, rows, strict=True)
             ],
             "data_half_widths": self._half_widths(solution),
-            "n_experience": self.n_experience,
+            "n_experience": longest(self.experience),
             "n_tuples": outcome.state.work,
             "seconds_learning": round(outcome.seconds, 3),
             "versions": versions(),

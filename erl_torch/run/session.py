@@ -20,7 +20,7 @@ from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.envs.tabular import TabularEnv
 from erl_torch.experience.experience import EXPERIENCE, Experience
-from erl_torch.experience.simulation import ReplicaExperience, Simulation, streams_of
+from erl_torch.experience.simulation import ReplicaExperience, Simulation, digest, longest
 from erl_torch.experience.sources import Source
 from erl_torch.experience.transitions import Transitions
 from erl_torch.files import alone
@@ -33,7 +33,7 @@ from erl_torch.mdp.tabular import TabularMDP, check_policy
 from erl_torch.notes import Note, collected
 from erl_torch.problem import Problem
 from erl_torch.rng import streams
-from erl_torch.run.build import accepted
+from erl_torch.run.build import accepted, steps_of
 from erl_torch.run.checkpoint import Checkpoints
 from erl_torch.run.groups import groups_among
 from erl_torch.run.judge import EvaluationSettings
@@ -122,8 +122,8 @@ def train(
     many = isinstance(learner, Replicas)
     given = _problem(problem, one.prior_policy, settings.horizon)
     learner.start(given)  # raises where the learner cannot learn this problem
-    digest = None if isinstance(experience, Source) else _digest(experience)
-    described = _described(learner, given, experience, seed, settings) | {"digest": digest}
+    checksum = None if isinstance(experience, Source) else digest(experience)
+    described = _described(learner, given, experience, seed, settings) | {"digest": checksum}
     saved = Checkpoints(Path(directory), described, checkpoint_every, getattr(one, "device", "cpu"), "directory")
     if saved.result() is not None:
         saved.clear()
@@ -137,7 +137,7 @@ def train(
             learner.check(experience, given.n_states, given.n_actions)
             groups, vary = groups_among(learner.learners)
             recorder = ReplicaRecorder(learner, given, experience, groups, seeds, vary, settings, title, lambda: None)
-            n_experience = recorder.n_experience
+            n_experience = longest(experience)
         else:
             if isinstance(experience, Source):
                 experience = experience(given, seed, lambda _: None)
@@ -152,7 +152,7 @@ def train(
             learner=learner,
             problem=given,
             experience=experience,
-            digest=_digest(experience) if digest is None else digest,
+            digest=digest(experience) if checksum is None else checksum,
             recorder=recorder,
             saved=saved,
             hyperparameters=hyperparameters(described, n_experience=n_experience),
@@ -215,9 +215,8 @@ def _problem(given: Given, prior_policy: Table, horizon: int) -> Problem:
         return Problem(TabularEnv(given), given, prior, given, horizon=horizon, name="mdp")
     checks.instance("problem", given, gym.Env, "an environment of Gymnasium's, a TabularMDP or a Problem")
     prior = check_policy("learner.prior_policy", prior_policy, *sizes(given))
-    limit = given.spec.max_episode_steps if given.spec is not None else None
     name = given.spec.id if given.spec is not None else type(given.unwrapped).__name__
-    return Problem(given, given, prior, known_mdp(given), horizon=min(horizon, limit or horizon), name=name)
+    return Problem(given, given, prior, known_mdp(given), horizon=steps_of(given, horizon), name=name)
 
 
 def _of_replicas(
@@ -236,14 +235,6 @@ def _of_replicas(
     if len(held) < len(recorded):
         raise InputError("experience", type(experience).__name__, "a source of tuples in memory, for replicas")
     return held, seeds
-
-
-def _digest(experience: Experience | ReplicaExperience | None) -> object:
-    if experience is None or isinstance(experience, Simulation):
-        return None
-    if isinstance(experience, Sequence):
-        return [data.checksum() for data in streams_of(experience)]
-    return experience.checksum()
 
 
 # -- what the run computes with, as text ----------------------------------------------------------------

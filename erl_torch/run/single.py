@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from erl_torch import checks
 from erl_torch.checks import InputError
@@ -64,6 +65,8 @@ class SingleRecorder:
     def __post_init__(self) -> None:
         self.model = judging_model(self.problem, self.settings)
         self.start: TabularState = self.learner.start(self.problem)
+        if not isinstance(self.start.policy, torch.Tensor):
+            raise InputError("policy of the learner", type(self.start.policy).__name__, "a torch.Tensor [S, A]")
         self.optimum = self._optimum() if self.settings.certify else None
         self.estimate = self._estimate() if self.settings.certify else None
         for _, text in self._reservations():

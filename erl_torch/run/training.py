@@ -22,7 +22,7 @@ from omegaconf import DictConfig, OmegaConf
 from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.experience.experience import Experience
-from erl_torch.experience.simulation import ReplicaExperience, Simulation, streams_of
+from erl_torch.experience.simulation import digest, longest
 from erl_torch.learners.learner import TabularLearner
 from erl_torch.learners.replicas import Replicas
 from erl_torch.learners.s1 import kernels
@@ -50,6 +50,8 @@ from erl_torch.run.replicas import ReplicaRecorder
 from erl_torch.run.report import Title
 from erl_torch.run.settings import check_keys
 from erl_torch.run.single import SingleRecorder
+
+Parts = tuple[Any, Any, Any, dict[str, Any]]  # of a run: learner, experience, recorder, hyperparameters besides
 
 
 def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lambda: None) -> dict[str, Any]:
@@ -90,8 +92,23 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
         world = make_world(cfg.env, env, safe_point)
         learner = make_learner(cfg.learner, *sizes(env))
         problem = make_problem(cfg, env, world, learner)
-        make = _replicas if many else _single
-        run = make(cfg, learner, problem, settings, saved, safe_point, began)
+        learner, experience, recorder, more = (_replicas if many else _single)(
+            cfg, learner, problem, settings, safe_point
+        )
+        run: Run[Any, Any, Any] = Run(
+            learner=learner,
+            problem=problem,
+            experience=experience,
+            digest=digest(experience),
+            recorder=recorder,
+            saved=saved,
+            hyperparameters=hyperparameters(plain(cfg), **more),
+            configuration=OmegaConf.to_yaml(cfg, resolve=True),
+            every=settings.every,
+            talks=True,
+            safe_point=safe_point,
+            began=began,
+        )
         _, result = run.perform(notes)
         return result
 
@@ -108,28 +125,6 @@ def plain(node: DictConfig) -> dict[str, Any]:
     return {str(key): value for key, value in values.items()}
 
 
-def _common(
-    cfg: DictConfig,
-    problem: Problem,
-    settings: EvaluationSettings,
-    saved: Checkpoints,
-    safe_point: SafePoint,
-    began: float,
-    **more: Any,  # hyperparameters
-) -> dict[str, Any]:
-    """Arguments of ``Run`` that all runs of a configuration share."""
-    return {
-        "problem": problem,
-        "saved": saved,
-        "hyperparameters": hyperparameters(plain(cfg), **more),
-        "configuration": OmegaConf.to_yaml(cfg, resolve=True),
-        "every": settings.every,
-        "talks": True,
-        "safe_point": safe_point,
-        "began": began,
-    }
-
-
 # -- one learner --------------------------------------------------------------------------------------
 
 
@@ -138,10 +133,8 @@ def _single(
     learner: TabularLearner[Any],
     problem: Problem,
     settings: EvaluationSettings,
-    saved: Checkpoints,
     safe_point: SafePoint,
-    began: float,
-) -> Run[Any, Experience, Any]:
+) -> Parts:
     learner.start(problem)  # raises where the learner cannot learn this problem
     experience: Experience | None = None
     n_skipped = 0
@@ -150,14 +143,7 @@ def _single(
         safe_point()
     title = Title(cfg.env.name, cfg.learner.name, cfg.seed)
     recorder = SingleRecorder(learner, problem, experience, settings, streams(cfg.seed).evaluation, title, n_skipped)
-    n_experience = 0 if experience is None else len(experience)
-    return Run(
-        learner=learner,
-        experience=experience,
-        digest=None if experience is None else experience.checksum(),
-        recorder=recorder,
-        **_common(cfg, problem, settings, saved, safe_point, began, n_experience=n_experience),
-    )
+    return learner, experience, recorder, {"n_experience": 0 if experience is None else len(experience)}
 
 
 # -- replicas -----------------------------------------------------------------------------------------
@@ -168,10 +154,8 @@ def _replicas(
     learner: TabularLearner[Any],
     problem: Problem,
     settings: EvaluationSettings,
-    saved: Checkpoints,
     safe_point: SafePoint,
-    began: float,
-) -> Run[Any, ReplicaExperience, Any]:
+) -> Parts:
     if learner.needs_model:
         allowed = "one that learns from experience: replicas of it would be the same"
         raise InputError("learner", cfg.learner.name, allowed)
@@ -187,16 +171,8 @@ def _replicas(
     experience = make_replica_experience(cfg, make_source(cfg.experience), problem, seeds, safe_point)
     title = Title(cfg.env.name, cfg.learner.name, cfg.seed)
     recorder = ReplicaRecorder(replicas, problem, experience, groups, seeds, vary, settings, title, safe_point)
-    digest = None if isinstance(experience, Simulation) else [data.checksum() for data in streams_of(experience)]
-    more = {"n_replicas": cfg.n_replicas, "n_experience": recorder.n_experience}
-    more |= {f"vary.{key}": values for key, values in vary.items()}
-    return Run(
-        learner=replicas,
-        experience=experience,
-        digest=digest,
-        recorder=recorder,
-        **_common(cfg, problem, settings, saved, safe_point, began, **more),
-    )
+    varied = {f"vary.{key}": values for key, values in vary.items()}
+    return replicas, experience, recorder, {"n_replicas": cfg.n_replicas, "n_experience": longest(experience)} | varied
 
 
 def _with(learner: Any, group: Group) -> Any:  # a dataclass of the user's choice
