@@ -50,8 +50,11 @@ class Simulation:
         if self.behaviour_policy is not None:
             behaviour = check_policy("behaviour_policy", self.behaviour_policy, self.mdp.n_states, self.mdp.n_actions)
             object.__setattr__(self, "behaviour_policy", behaviour)
-        for seed in checks.sequence("seeds", self.seeds):
+        seeds = checks.sequence("seeds", self.seeds)
+        for seed in seeds:
             checks.at_least("seeds", seed, 0)
+        if not isinstance(self.seeds, Sequence):
+            object.__setattr__(self, "seeds", seeds)  # an iterator is empty by now
 
     @property
     def n_tuples(self) -> int:

@@ -179,7 +179,8 @@ class Exact:
         assert mdp is not None
         problem = BellmanProblem.of(mdp, self.beta, self.prior_policy)
         if not len(state.value):  # no iteration could be made
-            return reducible_solution(mdp, problem, self.prior_policy)
+            none = reducible_solution(mdp, problem, self.prior_policy)
+            return none if failure is None else replace(none, status=Status.STOPPED, message="")
         below = [i for i, row in enumerate(history) if row["kl_max"] < KL_TOLERANCE]
         k = below[0] if below and self.method == "biasing" else None
         value, bounds = state.value, state.theta_bounds

@@ -66,6 +66,9 @@ class ReplicaState(Protocol):
     def replica(self, r: int) -> StreamState:
         """The state of one replica, as its own learner would have it."""
 
+    def epochs(self, r: int, n: int) -> int:
+        """The good epochs of one replica, where the run has made ``n``."""
+
     def milestone(self, learners: Sequence[StreamLearner[Any, Any]]) -> str:
         """The milestone of the replicas that reached one in the last epoch; "" if none did."""
 
@@ -202,12 +205,12 @@ class Replicas(Together):
         states: list[StreamState] = []
         before: list[object] = []
         for learner in self.learners:
-            settings = [*vars(learner).values()]
+            settings = [getattr(learner, field.name) for field in fields(learner)]
             # A state is a value: neighbours of the same settings share theirs.
             same = states and all(one is other for one, other in zip(settings, before, strict=True))
             states.append(states[-1] if same else learner.start(problem))
             before = settings
-        return EachState(tuple(states), {})
+        return EachState(tuple(states), {}, made=(0,) * len(states))
 
     def run(
         self, problem: Problem, experience: ReplicaExperience | None, state: ReplicaState | None = None
@@ -247,13 +250,9 @@ class Replicas(Together):
         """The solutions that ``state`` stands for; ``failure`` is what ended all of them."""
         solutions = []
         for r, learner in enumerate(self.learners):
-            own = state.replica(r)
-            rows: list[dict[str, float]] = []
-            for row in history:
-                if row["n_tuples"][r] == (rows[-1]["n_tuples"] if rows else 0):
-                    break  # it had stopped before
-                rows.append({name: values[r].item() for name, values in row.items()})
-            solutions.append(learner.solution(own, rows, state.failures.get(r, failure)))
+            made = history[: state.epochs(r, len(history))]
+            rows = [{name: values[r].item() for name, values in row.items()} for row in made]
+            solutions.append(learner.solution(state.replica(r), rows, state.failures.get(r, failure)))
         return ReplicaSolution(tuple(solutions), state.failures)
 
     def check(self, experience: ReplicaExperience, n_states: int, n_actions: int) -> None:
@@ -292,6 +291,7 @@ class EachState:
     states: tuple[StreamState, ...]
     failures: Mapping[int, NonFiniteError]
     stepped: tuple[int, ...] = ()  # the replicas that this epoch was of
+    made: tuple[int, ...] = ()  # epochs, of each replica
 
     @property
     def n_tuples(self) -> int:
@@ -307,6 +307,9 @@ class EachState:
 
     def replica(self, r: int) -> StreamState:
         return self.states[r]
+
+    def epochs(self, r: int, n: int) -> int:
+        return self.made[r]
 
     def milestone(self, learners: Sequence[StreamLearner[Any, Any]]) -> str:
         ended = [r for r in self.stepped if r not in self.failures and learners[r].milestone(self.states[r])]
@@ -326,6 +329,7 @@ def each(
     hold = fits(experience, len(replicas), learners[0].stream_bytes)
     states = list(state.states) if state else [learner.init(n_states, n_actions) for learner in learners]
     failures = dict(state.failures) if state else {}
+    made = list(state.made) if state else [0] * len(learners)
 
     def go_on(r: int) -> StreamState | NonFiniteError:
         try:
@@ -345,4 +349,5 @@ def each(
                     failures[r] = after
                 else:
                     states[r] = after
-            yield EachState(tuple(states), dict(failures), tuple(live))
+                    made[r] += 1
+            yield EachState(tuple(states), dict(failures), tuple(live), tuple(made))

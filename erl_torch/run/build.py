@@ -24,7 +24,7 @@ from erl_torch.experience.simulation import KEEP_BYTES, TUPLE_BYTES, ReplicaExpe
 from erl_torch.experience.sources import Source
 from erl_torch.experience.transitions import Transitions, join
 from erl_torch.files import read_npy
-from erl_torch.learners.learner import Learner, TabularLearner
+from erl_torch.learners.learner import CONTRACT, TabularLearner
 from erl_torch.mdp.from_gymnasium import MeanRewardWarning, absorbing, has_table, known_mdp, sizes, tabular_mdp
 from erl_torch.mdp.tabular import TabularMDP, check_policy
 from erl_torch.notes import note
@@ -37,7 +37,6 @@ REPLICA_BYTES = 10_000  # of a replica, besides: generators and settings
 LABELS = ("class", "name")  # keys of every group that are no arguments
 OF_THE_MODEL = ("stream", "n_samples", "model_seed")  # of a control task
 OF_NO_ENV = (*LABELS, "id", "suggest", *OF_THE_MODEL, *OF_EVERY_ENV)
-CONTRACT = [name for name in {**vars(Learner), **Learner.__annotations__} if not name.startswith("_")]
 
 
 class World(NamedTuple):
@@ -64,6 +63,7 @@ def make_env(cfg: DictConfig, render_mode: str | None = None) -> gym.Env[Any, An
         kind, spec = _env_class(keys)
         if "kwargs" in keys:
             arguments = keys["kwargs"]
+            checks.instance("kwargs", arguments, dict, "arguments by name, as in env.kwargs.is_slippery=false")
         elif kind is None:
             arguments = {
                 key: value for key, value in keys.items() if key not in OF_NO_ENV or key in ("bins", "low", "high")
@@ -268,7 +268,9 @@ def make_replica_experience(
     streams: dict[int, Transitions] = {}
     for seed in tqdm(sorted(set(seeds)), desc=source.work, unit=" streams", delay=1, leave=False, disable=None):
         with group("experience"):
-            streams[seed] = _in_memory(source(problem, seed, lambda _: safe_point()))
+            made = source(problem, seed, lambda _: safe_point())
+            checks.instance("class", made, Experience, f"a source of {EXPERIENCE}")
+            streams[seed] = _in_memory(made)
         safe_point()
     return [streams[seed] for seed in seeds]
 

@@ -37,6 +37,17 @@ from erl_torch.solution import Status
 from erl_torch.solvers import solve_soft_bellman
 
 MOST_LETTERS = 64  # of a setting that is text, in ``replicas.npz``
+WORST_FIRST = (
+    Status.NON_FINITE,
+    Status.STOPPED,
+    Status.PSI_LIMIT,
+    Status.STEP_LIMIT,
+    Status.STAGNATED,
+    Status.REDUCIBLE,
+    Status.UNCERTIFIED,
+    Status.COMPLETED,
+    Status.CONVERGED,
+)
 FEW = 24  # replicas whose simulated streams are sampled once more, to hold theta against what they say
 
 
@@ -96,6 +107,10 @@ class ReplicaRecorder:
         self.first = self.judges(np.repeat(self.problem.prior[None], len(self.replicas), axis=0), True)
 
     @property
+    def shape(self) -> tuple[int, ...]:
+        return (len(self.replicas),)
+
+    @property
     def boards(self) -> Boards:
         metrics = self.replicas.learners[0].start(self.problem).metrics()
         optima = dict(zip((group.name for group in self.groups[:MOST_LOGGED]), self.optima, strict=False))
@@ -116,9 +131,10 @@ class ReplicaRecorder:
     # -- checkpoints ----------------------------------------------------------------------------------
 
     def content(self) -> Content:
-        return {"record": self.recorded.content(), "evaluation": self.judges.generators()}
+        return {"record": self.recorded.content(), "evaluation": self.judges.generators(), "first": self.first}
 
     def restore(self, content: Content) -> None:
+        self.first = content["first"]
         self.recorded.restore(content["record"])
         self.judges.restore(content["evaluation"])
 
@@ -197,7 +213,7 @@ class ReplicaRecorder:
         return {
             "env": self.title.env,
             "learner": self.title.learner,
-            "seed": self.title.seed,
+            "seed": int(self.seeds[0]),
             "n_replicas": self._n_each,
             "vary": dict(self.vary),
             "status": Status.STOPPED.name.lower() if stopped else _status(solution),
@@ -215,6 +231,20 @@ class ReplicaRecorder:
             "versions": versions(),
         }
 
+    def _seeds_text(self) -> str:
+        """The seeds of each group, where all have the same; else all that there are."""
+        by_group = [[*np.array(self.seeds)[group.members]] for group in self.groups]
+        same = all(own == by_group[0] for own in by_group)
+        seeds = sorted(set(by_group[0] if same else self.seeds))
+        low, high = seeds[0], seeds[-1]
+        if len(seeds) == 1:
+            text = f"seed {low}"
+        elif len(seeds) == high - low + 1:
+            text = f"seeds {low} to {high}"
+        else:
+            text = f"{len(seeds)} seeds from {low} to {high}"
+        return f"{text} each" if same and len(self.groups) > 1 else text
+
     def _half_widths(self, solution: ReplicaSolution) -> dict[str, float] | None:
         """Statistics of how far each theta is from what its own stream says; None where no stream has an interval."""
         away = [
@@ -226,8 +256,7 @@ class ReplicaRecorder:
 
     def summary(self, result: Mapping[str, Any], directory: Path) -> str:
         name = f"{self.title.env}, {self.title.learner}"
-        last_seed = self.title.seed + self._n_each - 1
-        seeds = f"seed {self.title.seed}" if self._n_each == 1 else f"seeds {self.title.seed} to {last_seed}"
+        seeds = self._seeds_text()
         if len(self.groups) == 1:
             lines = ["", *_one_group(name, seeds, self.recorded.names, result)]
         else:
@@ -244,12 +273,8 @@ class ReplicaRecorder:
 
 
 def _status(solution: ReplicaSolution) -> str:
-    """The one that asks for most: what ended badly comes first."""
-    statuses = {one.status for one in solution.solutions}
-    for status in (Status.NON_FINITE, Status.STOPPED, Status.PSI_LIMIT, Status.STEP_LIMIT):
-        if status in statuses:
-            return status.name.lower()
-    return sorted(status.name for status in statuses)[0].lower()
+    """The worst of all replicas'."""
+    return min((one.status for one in solution.solutions), key=WORST_FIRST.index).name.lower()
 
 
 # -- what policies and streams are held against ------------------------------------------------------
@@ -407,7 +432,7 @@ def _one_group(first: str, seeds: str, names: Sequence[str], result: Mapping[str
 
 
 def _many_groups(first: str, seeds: str, groups: Sequence[Group], result: Mapping[str, Any]) -> Iterator[str]:
-    yield f"{first}, {len(groups)} settings, {seeds} each: {ended_as(result)}"
+    yield f"{first}, {len(groups)} settings, {seeds}: {ended_as(result)}"
     width = max(len(group.title) for group in groups) + 2
     yield f"{'':{width}}{'theta':>11}{'quartiles':>24}{'exact':>11}{'objective':>12}{'at most':>11}"
     shown = result["groups"] if len(groups) <= 40 else [*result["groups"][:20], None, *result["groups"][-19:]]

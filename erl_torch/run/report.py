@@ -107,8 +107,10 @@ def headline(heading: str, result: Mapping[str, Any]) -> list[str]:
 def last_rows(result: Mapping[str, Any], directory: Path) -> list[str]:
     """The last rows of a summary."""
     directory, logs = where(directory)
+    seconds, learning = result["seconds"], result["seconds_learning"]
+    remedy = "" if seconds < 30 or learning > seconds / 5 else "; evaluation.every=10 measures policies less often"
     return [
-        f"{'seconds':18}{result['seconds']:.1f}, of which {result['seconds_learning']:.1f} learning",
+        f"{'seconds':18}{seconds:.1f}, of which {learning:.1f} learning{remedy}",
         f"{'run directory':18}{directory}",
         f"{'look at it':18}tensorboard --logdir {logs}",
         *(f"{'note':18}{text}" for text in result["notes"]),

@@ -121,10 +121,11 @@ def check_keys(cfg: DictConfig, schema: type = Train) -> None:
 def check_comparison_keys(cfg: DictConfig) -> None:
     """``check_keys`` for ``conf/compare.yaml``: ``learner`` holds the settings of several, by name."""
     _check_node(cfg, Compare, "")
-    names = [str(name) for name, settings in cfg.learner.items() if "class" in settings]
+    learners = cfg.learner.items()
+    names = [str(name) for name, settings in learners if isinstance(settings, DictConfig) and "class" in settings]
     for name in map(str, cfg.learner):
         if name not in names:
-            raise InputError(f"learner.{name}", "", f"left out: the learners are {', '.join(names)}")
+            raise InputError(f"learner.{name}", cfg.learner[name], f"left out: the learners are {', '.join(names)}")
 
 
 def check_reproduction_keys(cfg: DictConfig) -> None:

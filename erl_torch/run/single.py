@@ -133,6 +133,10 @@ class SingleRecorder:
         return optimal_tags(solution, self.model, self.problem)
 
     @property
+    def shape(self) -> tuple[int, ...]:
+        return ()
+
+    @property
     def boards(self) -> Boards:
         table = with_own(self.learner.quantities)
         return layout([*self._names(self.start), *evaluation_tags(self.first)], self._constant, table)
@@ -144,8 +148,14 @@ class SingleRecorder:
             self._draw(self.start, 0, "prior policy", board)
 
     def record(self, state: TabularState, row: Row, milestone: str, board: Board) -> None:
-        self.last = self._measure(state.policy)
         position = self.learner.position(state)
+        policy = state.policy
+        if not isinstance(policy, torch.Tensor) or policy.shape != self.problem.prior.shape:
+            shape = list(self.problem.prior.shape)
+            raise InputError("policy of the learner", type(policy).__name__, f"a torch.Tensor {shape}, in every epoch")
+        if not torch.isfinite(policy).all():
+            raise NonFiniteError(position, "the policy has probabilities that are no numbers")
+        self.last = self._measure(policy)
         board.record(self._tags(state, position, row), position)
         if milestone:
             self._draw(state, position, milestone, board)

@@ -42,7 +42,7 @@ from erl_torch.run.build import (
     make_source,
     make_world,
 )
-from erl_torch.run.checkpoint import Checkpoints
+from erl_torch.run.checkpoint import Checkpoints, failure_of
 from erl_torch.run.groups import Group, groups_of
 from erl_torch.run.judge import EvaluationSettings
 from erl_torch.run.loop import Run, SafePoint
@@ -84,6 +84,8 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
     if (result := saved.result()) is not None:
         print(f"note: the run in {directory} is complete", file=sys.stderr)
         saved.clear()
+        if (failure := failure_of(result)) is not None:
+            raise failure
         return result
     for key in ("shared_stream", "keep_tuples"):
         if cfg[key] and not many:
@@ -161,7 +163,7 @@ def _replicas(
         raise InputError("learner", cfg.learner.name, allowed)
     check_sizes(problem.n_states, problem.n_actions, cfg.n_replicas)
     vary = plain(cfg.vary)
-    groups = groups_of(vary, cfg.n_replicas, plain(cfg.learner))
+    groups = groups_of(vary, cfg.n_replicas, plain(cfg.learner), float(learner.beta))
     check_sizes(problem.n_states, problem.n_actions, cfg.n_replicas * len(groups))
     learners = [_with(learner, one) for one in groups for _ in range(cfg.n_replicas)]
     for one in learners[:: cfg.n_replicas]:
