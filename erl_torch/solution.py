@@ -117,7 +117,7 @@ class Solution:
     ) -> Solution:
         """The solution of the policy ~ prior exp(beta q), q [S, A], with V = (1/beta) log sum_a prior exp(beta q).
 
-        Both are shifted so that their maximum is 0; q is -inf where the prior is 0. ``others`` are fields as they stand.
+        Both are shifted so that their maximum is 0; Q is -inf where the prior is 0. ``others`` are fields as they are.
         """
         q = torch.where(prior_policy > 0, q, -torch.inf)
         logits = beta * q + prior_policy.log()

@@ -136,9 +136,9 @@ class TabularMDP:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], normalise: bool = False) -> TabularMDP:
-        """Read what ``save`` wrote, or any npz with ``transition`` (or its CSR parts), ``reward`` and, unless uniform,
-        ``start``, and ``allowed`` unless the rewards tell; ``normalise`` as in the constructor. Raises InputError naming
-        the file."""
+        """Read what ``save`` wrote, or any npz with ``transition`` (or its CSR parts), ``reward`` and, where they are
+        not the default, ``start`` and ``allowed``; ``normalise`` as in the constructor. Raises InputError naming the
+        file."""
         arrays = read_npz(path)
         names = [f"transition_{name}" for name in CSR_PARTS]
         if "reward" not in arrays or not ("transition" in arrays or all(name in arrays for name in names)):
