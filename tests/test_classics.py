@@ -138,7 +138,7 @@ def test_access_control_accepts_who_pays_enough():
     ],
 )
 def test_arguments_are_checked(make, said):
-    with pytest.raises(InputError, match="") as caught:
+    with pytest.raises(InputError) as caught:
         make()
     assert said in str(caught.value)
 
@@ -235,7 +235,7 @@ def test_rules_as_a_function():
         (lambda s, a: [(0.5, 0, 0.0)], "transition row 0 (state 0, action 0)=sum 0.5"),
         (lambda s, a: [(-1.0, 0, 0.0)], "outcomes(0, 0): probability=-1.0"),
         (lambda s, a: [(1.0, 0, float("nan"))], "outcomes(0, 0): reward=nan"),
-        (lambda s, a: [], "state 0"),
+        (lambda s, a: [], "allowed[0]=no action"),
     ],
 )
 def test_rules_are_checked(outcomes, said):
@@ -284,7 +284,7 @@ def test_files_of_prism(tmp_path):
         (ROBOT.replace("3 1 3 1 stay", "3 1 4 1 stay"), "a state below 4"),
         (ROBOT.replace("1/2", "1/0"), "a number"),
         (ROBOT.replace("0.5 wait", "0.4 wait"), "state 0, action 1"),
-        (ROBOT.replace("2 0 0 1 end\n", "").replace("4 6 8", "4 5 7"), "state 2"),
+        (ROBOT.replace("2 0 0 1 end\n", "").replace("4 6 8", "4 5 7"), "allowed[2]=no action"),
         (ROBOT.replace("2 0 0 1 end", "2 -1 0 1"), "a whole number"),
     ],
 )

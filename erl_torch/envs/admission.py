@@ -40,9 +40,10 @@ class AdmissionEnv(TabularEnv):
     """Admit customers to a queue with one server, each of whom pays, and costs while in the system.
 
     ## Description
-    Customers arrive at rate `arrival_rate`, the server serves at rate `service_rate`, both exponential. A step is one event
-    of the two clocks together, 1 / (arrival_rate + service_rate) long on average. The policy says in advance whether a
-    customer who arrives in this step is admitted. Optimal is to admit below a threshold: 4 with the default, 2.86888 a step.
+    Customers arrive at rate `arrival_rate`, the server serves at rate `service_rate`, both exponential. A step is one
+    event of the two clocks together, 1 / (arrival_rate + service_rate) long on average. The policy says in advance
+    whether a customer who arrives in this step is admitted. Optimal is to admit below a threshold: 4 with the
+    default, 2.86888 a step.
 
     ## Action Space
     `Discrete(2)`: 0 reject, 1 accept; with `capacity` customers in the system both reject.
@@ -60,7 +61,8 @@ class AdmissionEnv(TabularEnv):
     None. The registered environment truncates after 1000 steps.
 
     ## Arguments
-    `arrival_rate` (.6), `service_rate` (.9), `payment` (10), `waiting_cost` (1), `capacity` (20), `render_mode` ("ansi").
+    `arrival_rate` (.6), `service_rate` (.9), `payment` (10), `waiting_cost` (1), `capacity` (20), `render_mode`
+    ("ansi").
 
     ## Version History
     v0: first version.

@@ -82,9 +82,9 @@ class CarRentalEnv(TabularEnv):
     """Move cars between two lots overnight, so that tomorrow's customers find them.
 
     ## Description
-    Cars at the two lots in the evening. Up to five are moved overnight, 2 each. Next day 3 and 4 customers on average (Poisson)
-    ask for a car and pay 10 where there is one; 3 and 2 cars come back on average and can be rented the day after. A lot
-    holds 20 cars; more go away.
+    Cars at the two lots in the evening. Up to five are moved overnight, 2 each. Next day 3 and 4 customers on average
+    (Poisson) ask for a car and pay 10 where there is one; 3 and 2 cars come back on average and can be rented the day
+    after. A lot holds 20 cars; more go away.
 
     ## Action Space
     `Discrete(11)`: a - 5 cars are moved from lot 1 to lot 2. A state has only the moves of cars that are there.
@@ -96,15 +96,15 @@ class CarRentalEnv(TabularEnv):
     Any, all as likely.
 
     ## Rewards
-    Mean rent, less the cost of the moves. With `extended`, as in Exercise 4.7, the first car from lot 1 to lot 2 is moved
-    for nothing, and a lot with more than 10 cars after the move costs 4.
+    Mean rent, less the cost of the moves. With `extended`, as in Exercise 4.7, the first car from lot 1 to lot 2 is
+    moved for nothing, and a lot with more than 10 cars after the move costs 4.
 
     ## Episode End
     None. The registered environment truncates after 1000 steps.
 
     ## Arguments
-    `capacity` (20), `most_drawn` (None: all that Poisson draws; 10: no requests or returns above 10, probabilities scaled
-    to sum 1, as most programs have it), `extended` (False), `render_mode` ("ansi").
+    `capacity` (20), `most_drawn` (None: all that Poisson draws; 10: no requests or returns above 10, probabilities
+    scaled to sum 1, as most programs have it), `extended` (False), `render_mode` ("ansi").
 
     ## Version History
     v0: first version.

@@ -38,7 +38,8 @@ class ForestEnv(TabularEnv):
     """Let a forest grow for wildlife, or cut it for wood, while fire may take it.
 
     ## Description
-    The forest ages by one each year unless it burns, with probability `fire_probability`; burnt or cut, it is young again.
+    The forest ages by one each year unless it burns, with probability `fire_probability`; burnt or cut, it is young
+    again.
 
     ## Action Space
     `Discrete(2)`: 0 wait, 1 cut.

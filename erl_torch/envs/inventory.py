@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-
 from erl_torch import checks
 from erl_torch.envs.tabular import TabularEnv
 from erl_torch.mdp.tabular import TabularMDP
@@ -68,8 +67,8 @@ class InventoryEnv(TabularEnv):
     None. The registered environment truncates after 1000 steps.
 
     ## Arguments
-    `capacity` (3), `demand` (probabilities of 0, 1, 2, ...: .25, .5, .25), `price` (8), `order_cost` (4), `unit_cost` (2),
-    `holding_cost` (1), `render_mode` ("ansi").
+    `capacity` (3), `demand` (probabilities of 0, 1, 2, ...: .25, .5, .25), `price` (8), `order_cost` (4), `unit_cost`
+    (2), `holding_cost` (1), `render_mode` ("ansi").
 
     ## Version History
     v0: first version.

@@ -39,9 +39,9 @@ class MachineReplacementEnv(TabularEnv):
     """Keep a machine that costs more as it wears, or replace it.
 
     ## Description
-    Wear goes up by one with probability `wear_probability` in each period in which the machine is kept; a new one has none.
-    Replacing at wear k costs (new_cost + sum of costs below k / p) / (1 + k / p) a period, p the probability of wear.
-    With the default, k = 2 is best, 50/23 a period.
+    Wear goes up by one with probability `wear_probability` in each period in which the machine is kept; a new one has
+    none. Replacing at wear k costs (new_cost + sum of costs below k / p) / (1 + k / p) a period, p the probability of
+    wear. With the default, k = 2 is best, 50/23 a period.
 
     ## Action Space
     `Discrete(2)`: 0 keep, 1 replace.

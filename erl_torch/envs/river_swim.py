@@ -63,8 +63,8 @@ class RiverSwimEnv(TabularEnv):
     """Swim against the current for a large reward far up, or drift for a small one.
 
     ## Description
-    States in a row. "Left" drifts down by one, surely. "Right" swims up and may fail. Three versions are found under this
-    name, with other probabilities and rewards; say which when you compare figures:
+    States in a row. "Left" drifts down by one, surely. "Right" swims up and may fail. Three versions are found under
+    this name, with other probabilities and rewards; say which when you compare figures:
 
     | `version` | up, stay, back | at the first state | at the last state | rewards |
     |---|---|---|---|---|

@@ -28,8 +28,8 @@ class TwoChoiceEnv(TabularEnv):
     """Choose between two loops of the same length, again and again.
 
     ## Description
-    From the fork, state 0, the first loop pays 1 with its first step, the second 2 with its last. Per step the second is
-    worth twice as much, which a discounted agent with a short horizon does not see. The process is periodic: plain
+    From the fork, state 0, the first loop pays 1 with its first step, the second 2 with its last. Per step the second
+    is worth twice as much, which a discounted agent with a short horizon does not see. The process is periodic: plain
     value iteration does not converge on it.
 
     ## Action Space

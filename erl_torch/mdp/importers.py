@@ -1,7 +1,7 @@
 """Finite MDPs in the forms that other packages give them, as the arrays that ``TabularMDP`` takes.
 
-Each function returns (transition [S*A, S] sparse, reward [S, A]): a pair that the state does not have is an empty row with
-reward -inf. ``TabularMDP`` has a constructor for each.
+Each function returns (transition [S*A, S] sparse, reward [S, A]): a pair that the state does not have is an empty row
+with reward -inf. ``TabularMDP`` has a constructor for each.
 """
 
 from __future__ import annotations
