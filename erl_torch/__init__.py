@@ -30,6 +30,7 @@ _PUBLIC = {
     "learners.replicas": "Replicas ReplicaSolution",
     "learners.s1.algorithm": "AlgorithmS1 ListedS1 S1State",
     "mdp.from_gymnasium": "MeanRewardWarning tabular_mdp",
+    "mdp.masks": "ActionMasks",
     "mdp.tabular": "TabularMDP",
     "notes": "Note",
     "problem": "Problem",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -15,7 +14,7 @@ from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.experience import kernels as experience_kernels
 from erl_torch.experience.collect import batched
-from erl_torch.experience.play import Plan, draw_action, episode, reset
+from erl_torch.experience.play import Draws, Plan, episode, reset
 from erl_torch.experience.sampling import policy_cdf, sampling_tables
 from erl_torch.mdp.from_gymnasium import ending_states, known_mdp, sizes
 from erl_torch.mdp.tabular import TabularMDP, check_policy, check_prior
@@ -51,12 +50,13 @@ def evaluate(
 
     Args:
         source: where the episodes are played; they end after ``horizon`` steps, or where the environment ends them.
-        policy: [S, A].
+        policy: [S, A]; 0 where the model's state does not have the action. In an environment that masks actions, those
+            that are left are played, with their shares.
         beta: inverse temperature, 1/reward.
         rng: draws the episodes.
         n_episodes: whole number >= 1, episodes behind ``mean_return``.
         horizon: whole number >= 1, steps of an episode, and of the exact reward per step.
-        prior_policy: [S, A], entries > 0; None is uniform.
+        prior_policy: [S, A], 0 where an action is not to be taken; None is uniform over the actions of each state.
         mdp: the model behind reward per step and objective; None is ``known_mdp(source)``.
         mean_return: computes the mean return of a policy [S, A]; no episodes are played then.
 
@@ -72,10 +72,11 @@ def evaluate(
         checks.instance("mdp", mdp, TabularMDP, "a TabularMDP")
         if mdp.reward.shape != (n_states, n_actions):
             raise InputError("mdp", f"MDP of shape {mdp.reward.shape}", f"of shape [{n_states}, {n_actions}]")
-    table = check_policy("policy", policy, n_states, n_actions)
-    prior = check_prior("prior_policy", prior_policy, n_states, n_actions)
     own_mdp = known_mdp(source)
     model = own_mdp if mdp is None else mdp
+    allowed = None if model is None else model.allowed
+    table = check_policy("policy", policy, n_states, n_actions, allowed)
+    prior = check_prior("prior_policy", prior_policy, n_states, n_actions, allowed)
     endless = isinstance(source, TabularMDP) or not ending_states(source, n_states).any()
     if model is not None and mean_return is not None:
         played = mean_return(table)
@@ -129,7 +130,7 @@ class Judge:
 
     def objective(self, policy: np.ndarray, beta: float) -> float:
         """``objective`` of a policy [S, A]."""
-        if self._small and (policy > 0).all():
+        if self._small and ((policy > 0) | ~self.mdp.allowed).all():
             chain = sp.csr_array((self._chain(policy), self._columns, self._rows))
             share, sound = solvers_kernels.gth(chain[self._inside][:, self._inside].toarray())
             parts = (self.mdp.transition, self.mdp.reward, self.prior, beta, policy)
@@ -160,7 +161,7 @@ def _evaluate_by_playing(
         uniform = np.full(policy.shape, 1 / policy.shape[1])  # a' is drawn, and not looked at
         data = batch(Plan(n_episodes, horizon, Streams(rng, rng, rng), policy, uniform, False), "original")
         return Evaluation(data.r.sum() / n_episodes, data.r.mean(), float((data.r - kl[data.s] / beta).mean()))
-    choose = partial(draw_action, np.cumsum(policy, axis=1), rng)
+    choose = Draws(policy, rng)
     total = total_kl = 0.0
     n_steps = 0
     for _ in range(n_episodes):

@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 
+from erl_torch.mdp.masks import ActionMasks
 from erl_torch.mdp.tabular import TabularMDP
 
 Policy: TypeAlias = torch.Tensor
@@ -22,11 +23,12 @@ class Problem:
     Args:
         env: where policies are played.
         source: where experience is collected: ``env``, or a model in its place.
-        prior: the prior policy, [S, A], entries > 0, rows sum to 1.
+        prior: the prior policy, [S, A], rows sum to 1; 0 where a state does not have the action.
         mdp: the model that policies are evaluated on, and that is solved to compare with; None where it is not known.
         episode: the model of one episode: its end is absorbed, without reward; None where there is none.
         horizon: steps of an episode at most, >= 1.
         name: what messages and pictures call it.
+        masks: where the actions of each state are noted, as ``env`` tells them; None where it does not.
     """
 
     env: gym.Env[Any, Any]
@@ -36,6 +38,17 @@ class Problem:
     episode: TabularMDP | None = None
     horizon: int = 1000
     name: str = "the environment"
+    masks: ActionMasks | None = None
+
+    @property
+    def allowed(self) -> np.ndarray:
+        """The actions that each state has, [S, A] bool: those with a prior above 0 that the model has, and the
+        environment as far as it has told."""
+        allowed = self.prior > 0
+        for known in (self.source, self.mdp):
+            if isinstance(known, TabularMDP):
+                allowed = allowed & known.allowed
+        return allowed if self.masks is None else allowed & self.masks.allowed
 
     @property
     def n_states(self) -> int:

@@ -56,6 +56,7 @@ def _rounded(x: float, digits: int, way: str) -> str:
 class Solution:
     """A policy with the tables and the record behind it (symbols as in ``erl_torch.learners.s1.algorithm``).
 
+    Where the prior is 0 the state does not have the action: policy, u and reward bias are 0 there, Q is -inf.
     ``history`` has one array per logged quantity, one entry per epoch. theta and rho are None where the learner
     estimates neither (discounted learners); bounds, gap and k where they are not known.
     """
@@ -116,8 +117,9 @@ class Solution:
     ) -> Solution:
         """The solution of the policy ~ prior exp(beta q), q [S, A], with V = (1/beta) log sum_a prior exp(beta q).
 
-        Both are shifted so that their maximum is 0; ``others`` are fields as they stand.
+        Both are shifted so that their maximum is 0; Q is -inf where the prior is 0. ``others`` are fields as they are.
         """
+        q = torch.where(prior_policy > 0, q, -torch.inf)
         logits = beta * q + prior_policy.log()
         value = logits.logsumexp(1) / beta
         shift = torch.maximum(q.max(), value.max())

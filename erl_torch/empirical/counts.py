@@ -2,7 +2,8 @@
 
 What no tuple shows is no part of the problem. ``EmpiricalMDP.problem`` poses the problem on the rest:
 
-    pairs     a pair (s,a) never visited is not available: the optimum is over the visited pairs. The KL cost is still
+    pairs     a pair (s,a) never visited, or with prior 0, is not available: the optimum is over the others. The KL cost
+              is still
               that of the whole prior, so with m(s) the prior's mass on the visited actions of s
               sum_visited pi0 exp(beta q) = m sum_visited (pi0/m) exp(beta q): a reward log(m(s))/beta on top.
     states    a state never left (as the last of an episode) has no known future: the tuples that lead there are
@@ -58,7 +59,7 @@ class EmpiricalMDP:
         """
         beta = checks.temperature("beta", beta)
         prior = check_prior("prior_policy", prior_policy, self.n_states, self.n_actions)
-        used, entries, message, reducible = self._solvable()
+        used, entries, message, reducible = self._solvable(prior > 0)
         taken = used.any(1)
         states = np.flatnonzero(taken)
         # A pair that is not used repeats one that is, with a prior of 0. So shapes stay [n, A], and the graph stays.
@@ -73,31 +74,34 @@ class EmpiricalMDP:
         weight = (prior * used)[states]
         mass = weight.sum(1, keepdims=True)
         reward = np.take_along_axis(self.reward[states], action, axis=1) + np.log(np.minimum(mass, 1.0)) / beta
-        start = self.visits[states].sum(1) / self.visits[states].sum()
+        visits = (self.visits * (prior > 0))[states]
+        start = visits.sum(1) / visits.sum()
         problem = BellmanProblem(states, p, reward, weight / mass, start, float(beta))
         return EmpiricalProblem(problem, used, message, reducible, np.minimum(mass[:, 0], 1.0))
 
-    def _solvable(self) -> tuple[np.ndarray, np.ndarray, str, bool]:
-        """(pairs that take part [S, A], entries of ``transition`` that do [nnz], message, several closed classes)."""
+    def _solvable(self, allowed: np.ndarray) -> tuple[np.ndarray, np.ndarray, str, bool]:
+        """(pairs that take part [S, A], entries of ``transition`` that do [nnz], message, several closed classes), of
+        the pairs ``allowed`` [S, A]."""
         p, n_actions = self.transition, self.n_actions
         pair_of = np.repeat(np.arange(self.visits.size), np.diff(p.indptr))
-        alive: np.ndarray = np.asarray(self.visits.any(1))
+        there, visits = allowed.ravel()[pair_of], self.visits * allowed
+        alive: np.ndarray = np.asarray(visits.any(1))
         while True:
-            entries = alive[p.indices] & alive[pair_of // n_actions]
+            entries = alive[p.indices] & alive[pair_of // n_actions] & there
             used = (np.bincount(pair_of, entries, self.visits.size) > 0).reshape(self.visits.shape)
             if (used.any(1) == alive).all():
                 break
             alive = np.asarray(used.any(1))
         if not alive.any():
             raise InputError("transitions", "a stream that never returns to any state", "long enough to have cycles")
-        lost = self.visits.any(1) & ~alive
+        lost = visits.any(1) & ~alive
         message = f"states {np.flatnonzero(lost)[:5].tolist()} lead nowhere in this stream" if lost.any() else ""
         origin, to = pair_of[entries] // n_actions, p.indices[entries]
         graph = sp.csr_array((np.ones(len(to)), (origin, to)), shape=(self.n_states, self.n_states))
         label, closed = classes(graph)
         closed[label[~alive]] = False  # states that take no part are classes of their own
         if closed.sum() > 1:
-            tuples = np.bincount(label, self.visits.sum(1)) * closed
+            tuples = np.bincount(label, visits.sum(1)) * closed
             members = label == np.argmax(tuples)
             used &= members[:, None]
             entries &= members[pair_of // n_actions]

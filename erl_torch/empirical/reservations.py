@@ -176,6 +176,8 @@ def divergence(counts: np.ndarray, row: np.ndarray, p: np.ndarray, n_rows: int) 
 
 def unlikely(total: float, freedom: int) -> bool:
     """Whether draws from p reach ``total`` with a chance below ``LEVEL``, by the module's bound."""
+    if total == np.inf:  # a draw of what has probability 0
+        return True
     if not total > freedom > 0:
         return False
     return bool(total - freedom - freedom * np.log(total / freedom) > -np.log(LEVEL))
@@ -206,7 +208,10 @@ def of_actions(counts: np.ndarray, prior: np.ndarray, name: str) -> list[Reserva
 def of_model(
     counted: Counted, mdp: TabularMDP, estimate: Estimate | None = None, bounds: tuple[float, float] | None = None
 ) -> list[Reservation]:
-    """Whether the data can come from ``mdp``: transitions, mean rewards and, where given, theta and its error."""
+    """Whether the data can come from ``mdp``: transitions, mean rewards and, where given, theta and its error.
+
+    Of actions that are not to be taken (prior 0) give ``mdp.restricted``: then they need not be met.
+    """
     contradictions = [*_transitions(counted.tally, mdp), *_rewards(counted, mdp)]
     if estimate is not None and bounds is not None and _covered(counted.tally, mdp):
         contradictions += _theta(estimate, bounds)
@@ -306,7 +311,7 @@ def _covered(seen: Tally, mdp: TabularMDP) -> bool:
     members: np.ndarray = np.asarray(tried.any(1))
     p = mdp.transition
     entry: np.ndarray = np.repeat(np.repeat(members, mdp.n_actions), np.diff(p.indptr))
-    return bool(tried[members].all() and members[p.indices[entry]].all())
+    return bool((tried | ~mdp.allowed)[members].all() and members[p.indices[entry]].all())
 
 
 def of_outcome(status: Status, message: str, learnt: float, prior: float) -> list[Reservation]:

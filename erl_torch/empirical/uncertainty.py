@@ -161,7 +161,7 @@ def theta_uncertainty(model: EmpiricalMDP, beta: float, prior_policy: ArrayLike 
     Args:
         model: counts and mean rewards, of ``empirical_mdp``.
         beta: inverse temperature, 1/reward, > 0.
-        prior_policy: [S, A], entries > 0; None is uniform.
+        prior_policy: [S, A], 0 where an action is not to be taken; None is uniform.
 
     Raises:
         InputError: beta or prior out of range, or a stream that never returns to any state.
@@ -194,7 +194,7 @@ def policy_uncertainty(
         model: counts and mean rewards, of ``empirical_mdp``.
         policy: [S, A], rows sum to 1.
         beta: inverse temperature, 1/reward, > 0.
-        prior_policy: [S, A], entries > 0; None is uniform.
+        prior_policy: [S, A], 0 where an action is not to be taken; None is uniform.
 
     Raises:
         InputError: a policy [S, A] that takes an action never tried (in a state of the empirical problem).
@@ -226,7 +226,7 @@ def bootstrap_theta(
     Args:
         model: counts and mean rewards, of ``empirical_mdp``.
         beta: inverse temperature, 1/reward, > 0.
-        prior_policy: [S, A], entries > 0; None is uniform.
+        prior_policy: [S, A], 0 where an action is not to be taken; None is uniform.
         n_resamples: whole number >= 2; each takes the solution of one model.
         seed: a whole number, or a generator.
 

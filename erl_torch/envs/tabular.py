@@ -16,6 +16,8 @@ from erl_torch.mdp.tabular import TabularMDP
 class TabularEnv(gym.Env[np.int64, np.int64]):
     """Step through a TabularMDP. Only the states of ``ends`` terminate an episode; a time limit truncates it.
 
+    Where some states lack an action, ``info["action_mask"]`` has those of the state.
+
     Observation: the state, Discrete(n_states). Action: Discrete(n_actions). Reward: ``mdp.reward[s, a]``.
 
     Args:
@@ -47,22 +49,30 @@ class TabularEnv(gym.Env[np.int64, np.int64]):
         super().reset(seed=seed)
         self.state = int(self.np_random.choice(self.mdp.n_states, p=self.mdp.start))
         self.last_action = None
-        return np.int64(self.state), {}
+        return np.int64(self.state), self._info()
 
     def step(self, action: np.int64) -> tuple[np.int64, float, bool, bool, dict[str, Any]]:
         if not self.action_space.contains(action):
             raise InputError("action", action, f"a whole number in [0, {self.mdp.n_actions})")
+        if not self.mdp.allowed[self.state, action]:
+            there = np.flatnonzero(self.mdp.allowed[self.state]).tolist()
+            raise InputError("action", action, f"one of {there}, as state {self.state} has no other")
         row = self.state * self.mdp.n_actions + int(action)
         reward = float(self.mdp.reward[self.state, action])
         self.last_action = int(action)
         if self.ends[self.state]:
-            return np.int64(self.state), reward, True, False, {}
+            return np.int64(self.state), reward, True, False, self._info()
         p = self.mdp.transition
         entries = slice(p.indptr[row], p.indptr[row + 1])
         cdf = np.cumsum(p.data[entries])
         drawn = int(np.searchsorted(cdf, self.np_random.random() * cdf[-1], side="right"))
         self.state = int(p.indices[entries][min(drawn, len(cdf) - 1)])
-        return np.int64(self.state), reward, False, False, {}
+        return np.int64(self.state), reward, False, False, self._info()
+
+    def _info(self) -> dict[str, Any]:
+        """``action_mask``, [A] int8, where a state of the MDP lacks an action."""
+        allowed = self.mdp.allowed
+        return {} if allowed.all() else {"action_mask": allowed[self.state].astype(np.int8)}
 
     def render(self) -> str | np.ndarray | None:
         if self.render_mode == "ansi":
@@ -75,7 +85,8 @@ class TabularFileEnv(TabularEnv):
 
     ## Description
     The arrays `transition` ([S, A, S] or [S*A, S]; or its sparse parts `transition_indptr`, `transition_indices`,
-    `transition_data`), `reward` [S, A] and `start` [S] (default uniform), as `erl_torch.TabularMDP.save` writes them.
+    `transition_data`), `reward` [S, A], `start` [S] (default uniform) and, where states lack actions, `allowed` [S, A]
+    (or `reward` -inf there), as `erl_torch.TabularMDP.save` writes them.
 
     ## Action Space
     `Discrete(n_actions)`.

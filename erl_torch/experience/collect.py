@@ -32,6 +32,7 @@ from erl_torch.experience.recording import FileRecording, read_experience, write
 from erl_torch.experience.sampling import Sampler
 from erl_torch.experience.transitions import COLUMNS, TYPES, Transitions, join
 from erl_torch.mdp.from_gymnasium import changed_by, known_mdp, sizes
+from erl_torch.mdp.masks import ActionMasks
 from erl_torch.mdp.tabular import TabularMDP, check_policy
 from erl_torch.rng import Streams, streams
 
@@ -53,6 +54,7 @@ def collect(
     prior_policy: ArrayLike | None = None,
     report: Report | None = None,
     save_to: None = None,
+    masks: ActionMasks | None = None,
 ) -> Transitions: ...
 
 
@@ -67,6 +69,7 @@ def collect(
     report: Report | None = None,
     *,
     save_to: str | os.PathLike[str],
+    masks: ActionMasks | None = None,
 ) -> Transitions | FileRecording: ...
 
 
@@ -79,6 +82,7 @@ def collect(
     prior_policy: ArrayLike | None = None,
     report: Report | None = None,
     save_to: str | os.PathLike[str] | None = None,
+    masks: ActionMasks | None = None,
 ) -> Transitions | FileRecording:
     """Collect experience, in memory or in a directory of columns.
 
@@ -88,19 +92,22 @@ def collect(
             vector environment, which ends its episodes itself; an environment's own ends make episodes shorter.
         seed: a whole number, or the streams of one.
         behaviour_policy: [S, A]; None is the prior.
-        prior_policy: [S, A], behind a'; None is uniform.
+        prior_policy: [S, A], behind a'; None is uniform over the actions of each state. Where the environment masks
+            actions (``info["action_mask"]``), it is taken on those that are left.
         report: called with the number of tuples after each block.
         save_to: a directory that the same tuples are written to, in the memory of one block, whatever their number.
             (This package's control tasks need the memory of all: their episodes are played at once.)
+        masks: where the actions of each state are noted, as the environment masks them.
 
     Returns:
         The tuples; with ``save_to``, what ``read_experience`` reads from there.
 
     Raises:
         InputError: an argument out of range, spaces that are not Discrete, tuples that do not fit the memory or the
-            disk, or a directory that holds anything but columns.
+            disk, a directory that holds anything but columns, a policy that takes an action that a state does not have,
+            or masks that differ between two visits of a state.
     """
-    arguments = n_episodes, episode_length, seed, behaviour_policy, prior_policy, report
+    arguments = n_episodes, episode_length, seed, behaviour_policy, prior_policy, report, masks
     if save_to is not None:
         return read_experience(record(source, save_to, *arguments), *sizes(source))
     chunks, n = _stream(source, "memory", *arguments)
@@ -116,9 +123,10 @@ def record(
     behaviour_policy: ArrayLike | None = None,
     prior_policy: ArrayLike | None = None,
     report: Report | None = None,
+    masks: ActionMasks | None = None,
 ) -> Path:
     """Write to ``directory`` without reading it back; else as ``collect`` with ``save_to``."""
-    arguments = n_episodes, episode_length, seed, behaviour_policy, prior_policy, report
+    arguments = n_episodes, episode_length, seed, behaviour_policy, prior_policy, report, masks
     return write_chunks(_stream(source, str(directory), *arguments)[0], directory)
 
 
@@ -131,6 +139,7 @@ def _stream(
     behaviour_policy: ArrayLike | None,
     prior_policy: ArrayLike | None,
     report: Report | None,
+    masks: ActionMasks | None,
 ) -> tuple[Iterator[Transitions], int]:
     """The tuples, a block at a time, and their number; 0 where it shows only as they come.
 
@@ -139,12 +148,14 @@ def _stream(
     n_episodes = checks.at_least("n_episodes", n_episodes, 1)
     episode_length = checks.at_least("episode_length", episode_length, 1)
     n_states, n_actions = sizes(source)
-    prior = check_policy("prior_policy", prior_policy, n_states, n_actions)
-    on_prior = behaviour_policy is None
-    behaviour = prior if on_prior else check_policy("behaviour_policy", behaviour_policy, n_states, n_actions)
-    rng = seed if isinstance(seed, Streams) else streams(seed)
-    plan = Plan(n_episodes, episode_length, rng, behaviour, prior, on_prior)
     mdp = known_mdp(source)
+    prior = check_policy("prior_policy", prior_policy, n_states, n_actions, None if mdp is None else mdp.allowed)
+    on_prior = behaviour_policy is None
+    behaviour = prior
+    if not on_prior:
+        behaviour = check_policy("behaviour_policy", behaviour_policy, n_states, n_actions, prior > 0)
+    rng = seed if isinstance(seed, Streams) else streams(seed)
+    plan = Plan(n_episodes, episode_length, rng, behaviour, prior, on_prior, masks)
     n = 0
     if mdp is not None or isinstance(source, gym.vector.VectorEnv):
         n = n_episodes * episode_length

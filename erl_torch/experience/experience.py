@@ -10,6 +10,7 @@ from typing import Generic, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
+from erl_torch.checks import InputError
 from erl_torch.experience.transitions import Checksum, Transitions, regroup
 
 EXPERIENCE = "experience, as of Transitions or read_experience"  # what is allowed, in messages
@@ -82,6 +83,40 @@ class Selection:
     def checksum(self) -> int:
         running = Checksum()
         return [running.of(chunk) for chunk in self.chunks()][-1]
+
+
+def permitted(
+    data: Experience, prior: np.ndarray, next_actions: bool, told: Callable[[str], None] | None = None
+) -> Experience:
+    """The tuples of ``data`` whose action has a prior [S, A] above 0, and with ``next_actions`` whose a' has; ``data``
+    itself where these are all.
+
+    Args:
+        data: the tuples.
+        prior: [S, A]; 0 where a state does not have the action.
+        next_actions: whether a' counts.
+        told: called with a line that says how many are left out.
+
+    Raises:
+        InputError: a tuple out of range, or no tuple that is left.
+    """
+    there = prior > 0
+    if there.all():
+        return data
+    data.check_range(*prior.shape)
+
+    def taken(chunk: Transitions) -> np.ndarray:
+        mask = there[chunk.s, chunk.a]
+        return np.asarray(mask & there[chunk.s_next, chunk.a_next] if next_actions else mask)
+
+    n = sum(int(taken(chunk).sum()) for chunk in data.chunks())
+    if n == len(data):
+        return data
+    if not n:
+        raise InputError("transitions", f"{len(data)} tuples", "some of actions whose prior is above 0")
+    if told is not None:
+        told(f"{len(data) - n:,} of {len(data):,} tuples are left out: the prior of their action is 0")
+    return data.where(taken(data)) if isinstance(data, Transitions) else Selection(data, taken, n)
 
 
 def tuple_at(data: Experience, t: int) -> tuple[int, int, float]:

@@ -48,7 +48,8 @@ class Simulation:
         checks.at_least("n_episodes", self.n_episodes, 1)
         checks.at_least("episode_length", self.episode_length, 1)
         if self.behaviour_policy is not None:
-            behaviour = check_policy("behaviour_policy", self.behaviour_policy, self.mdp.n_states, self.mdp.n_actions)
+            sizes = self.mdp.n_states, self.mdp.n_actions
+            behaviour = check_policy("behaviour_policy", self.behaviour_policy, *sizes, self.mdp.allowed)
             object.__setattr__(self, "behaviour_policy", behaviour)
         seeds = checks.sequence("seeds", self.seeds)
         for seed in seeds:

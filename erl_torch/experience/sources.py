@@ -86,12 +86,12 @@ class Simulate(Source):
         sizes = self.n_episodes, self.episode_length
         behaviour = self._behaviour()
         if self.save_to is None:
-            return collect(problem.source, *sizes, seed, behaviour, problem.prior, report)
+            return collect(problem.source, *sizes, seed, behaviour, problem.prior, report, masks=problem.masks)
         check_target("save_to", self.save_to)
         if self.save_to.endswith("/"):
-            path = record(problem.source, self.save_to, *sizes, seed, behaviour, problem.prior, report)
+            path = record(problem.source, self.save_to, *sizes, seed, behaviour, problem.prior, report, problem.masks)
             return read_experience(path, problem.n_states, problem.n_actions)
-        data = collect(problem.source, *sizes, seed, behaviour, problem.prior, report)
+        data = collect(problem.source, *sizes, seed, behaviour, problem.prior, report, masks=problem.masks)
         check_target("save_to", self.save_to)  # again: the collecting may have taken hours
         data.save(self.save_to)
         return data

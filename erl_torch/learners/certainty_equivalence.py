@@ -21,7 +21,7 @@ from erl_torch import checks
 from erl_torch.empirical.counts import EmpiricalMDP, EmpiricalProblem, empirical_mdp
 from erl_torch.experience.experience import Experience
 from erl_torch.learners.learner import StreamLearner, columns, message
-from erl_torch.mdp.tabular import check_policy
+from erl_torch.mdp.tabular import check_prior
 from erl_torch.solution import Solution, Status, proven
 from erl_torch.solvers.soft_bellman import solve_problem
 
@@ -35,7 +35,7 @@ class CertaintyEquivalenceState:
     beta: float
     prior_policy: torch.Tensor  # [S, A]
     policy: torch.Tensor  # [S, A]; 0 on pairs never visited, the prior in states outside the empirical problem
-    u: torch.Tensor  # [S, A], largest 1; 0 on pairs never visited
+    u: torch.Tensor  # [S, A], largest 1; 0 on pairs never visited, or with prior 0
     rho: float
     theta: float  # middle of the bounds on the empirical theta*; of the closed set where the model is reducible
     reward_bias: torch.Tensor  # [S, A]
@@ -76,7 +76,7 @@ class CertaintyEquivalence(StreamLearner[CertaintyEquivalenceState, CertaintyEqu
         beta: inverse temperature, 1/reward, > 0.
         tol: width of the bounds on the empirical theta* to stop at, relative to the range of the rewards.
         max_steps: Newton steps at most.
-        prior_policy: [S, A], entries > 0; None is uniform.
+        prior_policy: [S, A], 0 where an action is not to be taken; None is uniform.
 
     Raises:
         InputError: an argument out of its range.
@@ -107,8 +107,8 @@ class CertaintyEquivalence(StreamLearner[CertaintyEquivalenceState, CertaintyEqu
 
     def init(self, n_states: int, n_actions: int) -> CertaintyEquivalenceState:
         """The prior policy, before any tuple."""
-        prior = torch.from_numpy(check_policy("prior_policy", self.prior_policy, n_states, n_actions))
-        zero, one = torch.zeros_like(prior), torch.ones_like(prior)
+        prior = torch.from_numpy(check_prior("prior_policy", self.prior_policy, n_states, n_actions))
+        zero, one = torch.zeros_like(prior), (prior > 0).double()
         return CertaintyEquivalenceState(0, 0, self.beta, prior, prior, one, 1.0, 0.0, zero, math.inf)
 
     def prepare(self, transitions: Experience, n_states: int, n_actions: int) -> CertaintyEquivalenceStream:
@@ -169,7 +169,7 @@ class CertaintyEquivalence(StreamLearner[CertaintyEquivalenceState, CertaintyEqu
         answer = state.answer or Solution(
             policy=state.policy,
             u=state.u,
-            psi=1 / state.u.mean(1),
+            psi=torch.ones(len(state.u), dtype=torch.float64),
             rho=state.rho,
             theta=state.theta,
             reward_bias=state.reward_bias,

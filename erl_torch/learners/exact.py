@@ -18,7 +18,7 @@ from erl_torch.checks import InputError
 from erl_torch.experience.experience import Experience
 from erl_torch.learners.learner import columns
 from erl_torch.log.quantities import Quantity
-from erl_torch.mdp.tabular import TabularMDP, check_policy
+from erl_torch.mdp.tabular import TabularMDP, check_prior
 from erl_torch.problem import Problem
 from erl_torch.solution import Solution, Status, proven
 from erl_torch.solvers.biasing import KL_TOLERANCE, BiasingState, iterate_biasing, solve_biasing
@@ -65,7 +65,7 @@ class Exact:
         method: "biasing" or "soft_bellman".
         tol: width of the bounds on theta* to stop at, as in ``solve_soft_bellman``.
         max_steps: iterations at most.
-        prior_policy: [S, A], entries > 0; None is uniform.
+        prior_policy: [S, A], 0 where an action is not to be taken; None is uniform over the actions of each state.
 
     Raises:
         InputError: an argument out of its range.
@@ -98,14 +98,14 @@ class Exact:
 
     def init(self, n_states: int, n_actions: int) -> ExactState:
         """The prior policy, before anything is known."""
-        prior = check_policy("prior_policy", self.prior_policy, n_states, n_actions)
+        prior = check_prior("prior_policy", self.prior_policy, n_states, n_actions)
         nothing = torch.zeros(n_states, n_actions, dtype=torch.float64)
         return ExactState(0, torch.from_numpy(prior), nothing, 1.0, (-np.inf, np.inf), 0.0, np.zeros(0))
 
     def iterate(self, mdp: TabularMDP) -> Iterator[ExactState]:
         """Yield each iteration until the bounds are within ``tol``."""
         problem = BellmanProblem.of(mdp, self.beta, self.prior_policy)
-        prior = check_policy("prior_policy", self.prior_policy, mdp.n_states, mdp.n_actions)
+        prior = check_prior("prior_policy", self.prior_policy, mdp.n_states, mdp.n_actions, mdp.allowed)
         ref = problem.regeneration_state()
         if ref is None or (self.method == "biasing" and len(problem.classes[1]) > 1):
             return
@@ -141,7 +141,9 @@ class Exact:
 
     def start(self, problem: Problem) -> ExactState:
         """``init``, of the model of ``problem``. Raises InputError where there is none."""
-        return replace(self.init(problem.n_states, problem.n_actions), mdp=self._model(problem))
+        start, mdp = self.init(problem.n_states, problem.n_actions), self._model(problem)
+        prior = check_prior("prior_policy", self.prior_policy, mdp.n_states, mdp.n_actions, mdp.allowed)
+        return replace(start, policy=torch.from_numpy(prior), mdp=mdp)
 
     def _model(self, problem: Problem) -> TabularMDP:
         if problem.mdp is None:
@@ -178,15 +180,16 @@ class Exact:
         mdp = state.mdp
         assert mdp is not None
         problem = BellmanProblem.of(mdp, self.beta, self.prior_policy)
+        prior = check_prior("prior_policy", self.prior_policy, mdp.n_states, mdp.n_actions, mdp.allowed)
         if not len(state.value):  # no iteration could be made
-            none = reducible_solution(mdp, problem, self.prior_policy)
+            none = reducible_solution(mdp, problem, prior)
             return none if failure is None else replace(none, status=Status.STOPPED, message="")
         below = [i for i, row in enumerate(history) if row["kl_max"] < KL_TOLERANCE]
         k = below[0] if below and self.method == "biasing" else None
         value, bounds = state.value, state.theta_bounds
         if failure is None and state.step < self.max_steps:
             value, bounds = polish(problem, value, bounds, self.tol)
-        solution = ended(mdp, problem, value, bounds, self.tol, state.step, self.max_steps, self.prior_policy, k)
+        solution = ended(mdp, problem, value, bounds, self.tol, state.step, self.max_steps, prior, k)
         if failure is not None:
             solution = replace(solution, status=Status.STOPPED, message="")
         return replace(solution, history=columns(history))

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import numpy as np
 import torch
 
 from erl_torch import checks
-from erl_torch.experience.experience import EXPERIENCE, Experience
+from erl_torch.experience.experience import EXPERIENCE, Experience, permitted
 from erl_torch.log.quantities import Quantity
+from erl_torch.mdp.tabular import check_policy, uniform
 from erl_torch.problem import Policy, Problem
 from erl_torch.solution import Solution, Status
 
@@ -132,7 +134,7 @@ class TabularLearner(Learner[S, Experience, Solution], Protocol[S]):
 
     @property
     def prior_policy(self) -> Table:
-        """[S, A]; None is uniform."""
+        """[S, A], 0 where a state does not have the action; None is uniform."""
 
     @property
     def averages_exp_reward(self) -> bool:
@@ -231,20 +233,27 @@ class StreamLearner(ABC, Generic[T, Prepared]):
         then still good.
         """
         checks.instance("transitions", transitions, Experience, EXPERIENCE)
-        stream = self.prepare(transitions, n_states, n_actions)
+        stream = self.prepare(self.permitted(transitions, n_states, n_actions), n_states, n_actions)
         state = self.init(n_states, n_actions) if state is None else state
         while not self.finished(state):
             state = self.step(state, stream)
             yield state
 
+    def permitted(self, transitions: Experience, n_states: int, n_actions: int) -> Experience:
+        """The tuples of actions that there are, those with a prior above 0: what is learnt from."""
+        prior = check_policy("prior_policy", self.prior_policy, n_states, n_actions)
+        return permitted(transitions, prior, self.drawn_from_prior == "a_next")
+
     def start(self, problem: Problem) -> T:
-        """``init``, with the sizes of ``problem``."""
-        return self.init(problem.n_states, problem.n_actions)
+        """``init``, with the sizes of ``problem``, and the actions that its states have."""
+        learner: StreamLearner[T, Prepared] = with_prior(self, problem.allowed)
+        return learner.init(problem.n_states, problem.n_actions)
 
     def run(self, problem: Problem, experience: Experience | None, state: T | None = None) -> Iterator[T]:
-        """``iterate``, with the sizes of ``problem``."""
+        """``iterate``, with the sizes of ``problem``, and the actions that its states have."""
         assert experience is not None
-        return self.iterate(experience, problem.n_states, problem.n_actions, state)
+        learner: StreamLearner[T, Prepared] = with_prior(self, problem.allowed)
+        return learner.iterate(experience, problem.n_states, problem.n_actions, state)
 
     def position(self, state: T) -> int:
         """Tuples streamed so far."""
@@ -271,6 +280,30 @@ class StreamLearner(ABC, Generic[T, Prepared]):
         if isinstance(failure, NonFiniteError):
             return Status.NON_FINITE
         return Status.COMPLETED if self.finished(state) else Status.STOPPED
+
+
+def with_prior(learner: Any, allowed: np.ndarray) -> Any:  # of any class
+    """``learner`` (or replicas of one), whose default prior is uniform over the actions of ``allowed`` [S, A] bool."""
+    one = learner.learners[0] if hasattr(learner, "learners") else learner
+    if allowed.all() or one.prior_policy is not None:
+        return learner
+    return _of_prior(learner, uniform(allowed))
+
+
+def as_told(learner: Any, problem: Problem) -> tuple[Any, Problem]:
+    """``learner`` (or replicas of one) and ``problem``, their prior on the actions that the environment has told while
+    it was stepped; the shares of those that are left stay."""
+    if problem.masks is None or problem.masks.allowed.all():
+        return learner, problem
+    kept = problem.prior * problem.allowed
+    prior = kept / kept.sum(1, keepdims=True)
+    return _of_prior(learner, prior), replace(problem, prior=prior)
+
+
+def _of_prior(learner: Any, prior: np.ndarray) -> Any:
+    if hasattr(learner, "learners"):
+        return replace(learner, learners=tuple(replace(one, prior_policy=prior) for one in learner.learners))
+    return replace(learner, prior_policy=prior)
 
 
 def message(failure: BaseException | None) -> str:

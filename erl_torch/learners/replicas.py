@@ -21,7 +21,7 @@ A replica that leaves the finite numbers stays at its last good epoch, named in 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -32,10 +32,11 @@ import torch
 
 from erl_torch import checks
 from erl_torch.checks import InputError
-from erl_torch.experience.simulation import ReplicaExperience, Simulation, fits, longest, tuples_of
+from erl_torch.experience.experience import permitted
+from erl_torch.experience.simulation import ReplicaExperience, Simulation, fits, longest, streams_of, tuples_of
 from erl_torch.experience.transitions import Transitions
 from erl_torch.files import read_npz, write_npz
-from erl_torch.learners.learner import NonFiniteError, StreamLearner, StreamState, columns
+from erl_torch.learners.learner import NonFiniteError, StreamLearner, StreamState, columns, with_prior
 from erl_torch.learners.s1.algorithm import AlgorithmS1
 from erl_torch.learners.s1.lanes import LanesState, can_interleave, interleave
 from erl_torch.learners.together import Together, check_learner
@@ -191,7 +192,10 @@ class Replicas(Together):
         state: Any = None,  # of the engine that runs
     ) -> Iterator[ReplicaState]:
         """Yield the state of all replicas after each epoch, from ``state`` on, until the last is done or has failed."""
+        if isinstance(experience, Simulation):
+            self = with_prior(self, experience.mdp.allowed)
         self.check(experience, n_states, n_actions)
+        experience = self.permitted(experience, n_states, n_actions)
         run = interleave if can_interleave(self, experience) else each
         return run(self, experience, n_states, n_actions, state)
 
@@ -215,9 +219,10 @@ class Replicas(Together):
     def run(
         self, problem: Problem, experience: ReplicaExperience | None, state: ReplicaState | None = None
     ) -> Iterator[ReplicaState]:
-        """``iterate``, with the sizes of ``problem``."""
+        """``iterate``, with the sizes of ``problem``, and the actions that its states have."""
         assert experience is not None
-        return self.iterate(experience, problem.n_states, problem.n_actions, state)
+        replicas: Replicas = with_prior(self, problem.allowed)
+        return replicas.iterate(experience, problem.n_states, problem.n_actions, state)
 
     def position(self, state: ReplicaState) -> int:
         """Tuples that each replica has streamed so far."""
@@ -255,6 +260,21 @@ class Replicas(Together):
             solutions.append(learner.solution(state.replica(r), rows, state.failures.get(r, failure)))
         return ReplicaSolution(tuple(solutions), state.failures)
 
+    def permitted(
+        self, experience: ReplicaExperience, n_states: int, n_actions: int, told: Callable[[str], None] | None = None
+    ) -> ReplicaExperience:
+        """The tuples of actions that there are, those with a prior above 0, as ``experience.permitted``; of a
+        simulation these are all."""
+        prior = self.prior_policy(n_states, n_actions)
+        if isinstance(experience, Simulation) or (prior > 0).all():
+            return experience
+        next_actions = any(learner.drawn_from_prior == "a_next" for learner in self.learners)
+        kept: dict[int, Any] = {}
+        for data in streams_of(experience):
+            if id(data) not in kept:
+                kept[id(data)] = permitted(data, prior, next_actions, told)
+        return kept[id(experience)] if isinstance(experience, Transitions) else [kept[id(data)] for data in experience]
+
     def check(self, experience: ReplicaExperience, n_states: int, n_actions: int) -> None:
         """Raise InputError unless ``experience`` is what the replicas can learn from."""
         prior = self.prior_policy(n_states, n_actions)
@@ -274,6 +294,10 @@ class Replicas(Together):
         if isinstance(experience, Simulation) and experience.mdp.reward.shape != (n_states, n_actions):
             shape = experience.mdp.reward.shape
             raise InputError("experience", f"an MDP of shape {shape}", f"of shape {(n_states, n_actions)}")
+        if isinstance(experience, Simulation):
+            check_policy("prior_policy", prior, n_states, n_actions, experience.mdp.allowed)
+            if experience.behaviour_policy is not None:
+                check_policy("behaviour_policy", experience.behaviour_policy, n_states, n_actions, prior > 0)
 
 
 def _number(value: np.ndarray | float) -> object:

@@ -113,13 +113,19 @@ def _own_start(env: gym.Env[Any, Any]) -> ArrayLike | None:
 # -- the model ----------------------------------------------------------------------------------------------
 
 
-def tabular_mdp(env: gym.Env[Any, Any], on_end: str = "restart", start: ArrayLike | None = None) -> TabularMDP:
+def tabular_mdp(
+    env: gym.Env[Any, Any],
+    on_end: str = "restart",
+    start: ArrayLike | None = None,
+    allowed: ArrayLike | None = None,
+) -> TabularMDP:
     """The model of an environment that has one; see the module's docstring.
 
     Args:
         env: with Discrete spaces, and ``P`` or ``mdp``, without a wrapper that changes the process.
         on_end: "restart" or "absorb".
         start: [S], the start distribution; None is the environment's own.
+        allowed: [S, A] bool, the actions that each state has; None is all that the model has.
 
     Raises:
         InputError: no model, a table that is not as above, or a model that leaves out part of the process.
@@ -134,7 +140,9 @@ def tabular_mdp(env: gym.Env[Any, Any], on_end: str = "restart", start: ArrayLik
         raise InputError("env", env, f"without {changed}, under which the model is not known")
     mdp = known_mdp(env)
     if mdp is not None:
-        mdp = TabularMDP(mdp.transition, mdp.reward, mdp.start if start is None else start)  # type: ignore[arg-type]
+        mask = mdp.allowed if allowed is None else mdp.allowed & np.asarray(allowed, bool)
+        first = mdp.start if start is None else start
+        mdp = TabularMDP(mdp.transition, mdp.reward, first, allowed=mask)  # type: ignore[arg-type]
         ends = np.flatnonzero(ending_states(env, mdp.n_states))
         return mdp if on_end == "restart" else _absorbed(mdp, ends, mdp.reward[ends])
     n_states, n_actions = sizes(env)
@@ -143,6 +151,8 @@ def tabular_mdp(env: gym.Env[Any, Any], on_end: str = "restart", start: ArrayLik
     first = _start(_own_start(env) if start is None else start, n_states)
     mean = np.bincount(row, p * r, n_rows)
     deviation = np.sqrt(np.bincount(row, p * (r - mean[row]) ** 2, n_rows))
+    if allowed is not None:
+        deviation *= np.asarray(allowed, bool).ravel()
     varies = deviation > 1e-9 * max(1.0, np.abs(r).max())
     if varies.any():
         warnings.warn(
@@ -156,10 +166,9 @@ def tabular_mdp(env: gym.Env[Any, Any], on_end: str = "restart", start: ArrayLik
     if on_end == "restart":
         ending = np.bincount(row[end], p[end], n_rows)
         transition = on + sp.csr_array(ending[:, None]) @ sp.csr_array(first[None, :])
-        return TabularMDP(transition, mean.reshape(n_states, n_actions), first)
-    mdp = TabularMDP(
-        on + sp.coo_array((p[end], (row[end], to[end])), shape=shape), mean.reshape(n_states, n_actions), first
-    )
+        return TabularMDP(transition, mean.reshape(n_states, n_actions), first, allowed=allowed)  # type: ignore[arg-type]
+    transition = on + sp.coo_array((p[end], (row[end], to[end])), shape=shape)
+    mdp = TabularMDP(transition, mean.reshape(n_states, n_actions), first, allowed=allowed)  # type: ignore[arg-type]
     terminal = np.unique(to[end])
     both = np.intersect1d(terminal, to[~end & ~np.isin(row // n_actions, terminal)])
     if both.size:
@@ -171,7 +180,7 @@ def absorbing(mdp: TabularMDP) -> np.ndarray:
     """[S] bool: states that no action leaves."""
     rows = np.arange(mdp.n_states * mdp.n_actions)
     stays = np.asarray(mdp.transition[rows, rows // mdp.n_actions]).reshape(mdp.n_states, mdp.n_actions)
-    return np.asarray((stays > 1 - 1e-12).all(1))
+    return np.asarray(((stays > 1 - 1e-12) | ~mdp.allowed).all(1))
 
 
 def changed_by(env: gym.Env[Any, Any]) -> str | None:
@@ -221,4 +230,4 @@ def _absorbed(mdp: TabularMDP, states: np.ndarray, reward: np.ndarray) -> Tabula
     loops = sp.coo_array((per_row, (np.arange(per_row.size), state)), shape=mdp.transition.shape)
     table = mdp.reward.copy()
     table[states] = reward
-    return TabularMDP(sp.diags_array(1 - per_row) @ mdp.transition + loops, table, mdp.start)
+    return TabularMDP(sp.diags_array(1 - per_row) @ mdp.transition + loops, table, mdp.start, allowed=mdp.allowed)

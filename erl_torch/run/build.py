@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import gymnasium as gym
+import numpy as np
 from gymnasium.envs.registration import EnvSpec, load_env_creator
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
@@ -26,6 +27,7 @@ from erl_torch.experience.transitions import Transitions, join
 from erl_torch.files import read_npy
 from erl_torch.learners.learner import CONTRACT, TabularLearner
 from erl_torch.mdp.from_gymnasium import MeanRewardWarning, absorbing, has_table, known_mdp, sizes, tabular_mdp
+from erl_torch.mdp.masks import ActionMasks
 from erl_torch.mdp.tabular import TabularMDP, check_policy
 from erl_torch.notes import note
 from erl_torch.problem import Problem
@@ -45,6 +47,12 @@ class World(NamedTuple):
     source: TabularMDP | gym.Env[Any, Any]  # of the stream
     mdp: TabularMDP | None  # the model to evaluate on, to certify with, and to solve
     episode: TabularMDP | None = None  # the model of one episode: its end is absorbed, without reward
+
+    @property
+    def allowed(self) -> np.ndarray | None:
+        """The actions that each state has, [S, A] bool, as the model tells them; None where there is none."""
+        mdp = self.source if isinstance(self.source, TabularMDP) else self.mdp
+        return None if mdp is None else mdp.allowed
 
 
 @contextlib.contextmanager
@@ -114,6 +122,7 @@ def make_world(cfg: DictConfig, env: gym.Env[Any, Any], safe_point: SafePoint) -
         return _control_world(cfg, env, safe_point)
     on_end = cfg.get("on_end", "restart")
     checks.one_of("env.on_end", on_end, ("restart", "absorb"))
+    allowed = masks_of(env) if cfg.get("use_action_mask") else None
     if known_mdp(env) is not None or not cfg.get("use_model") or not has_table(env):
         if on_end == "absorb":
             raise InputError("env.on_end", on_end, "restart, where there is no model (P) to read")
@@ -123,7 +132,7 @@ def make_world(cfg: DictConfig, env: gym.Env[Any, Any], safe_point: SafePoint) -
         warnings.simplefilter("always", MeanRewardWarning)
         for reading in ("restart", "absorb"):
             try:
-                models[reading] = tabular_mdp(env, reading)
+                models[reading] = tabular_mdp(env, reading, allowed=allowed)
             except InputError as error:
                 if reading == on_end == "absorb":
                     raise error.within("env") from error
@@ -136,6 +145,18 @@ def make_world(cfg: DictConfig, env: gym.Env[Any, Any], safe_point: SafePoint) -
         episode = None  # an end that pays for ever is no end
     mdp = models.get(on_end)
     return World(env if mdp is None else mdp, mdp, episode)
+
+
+def masks_of(env: gym.Env[Any, Any]) -> np.ndarray:
+    """[S, A] bool: the actions that each state has, as ``action_mask(state)`` of an environment (Taxi's) tells. Raises
+    InputError where there is no such method."""
+    tell = getattr(env.unwrapped, "action_mask", None)
+    if not callable(tell):
+        allowed = "false: the environment has no method action_mask(state) (masks in info are used in any case)"
+        raise InputError("env.use_action_mask", True, allowed)
+    n_states, n_actions = sizes(env)
+    rows = [checks.array(f"action_mask({s})", tell(s), (n_actions,)) for s in range(n_states)]
+    return np.stack(rows) > 0
 
 
 def _control_world(cfg: DictConfig, env: gym.Env[Any, Any], safe_point: SafePoint) -> World:
@@ -161,9 +182,10 @@ def _control_world(cfg: DictConfig, env: gym.Env[Any, Any], safe_point: SafePoin
 
 def make_problem(cfg: DictConfig, env: gym.Env[Any, Any], world: World, learner: TabularLearner[Any]) -> Problem:
     """What there is to learn in ``env`` as the run ``cfg`` says, with the prior of ``learner``. Raises InputError."""
-    prior = check_policy("learner.prior_policy", learner.prior_policy, *sizes(env))
+    shape = sizes(env)
+    prior = check_policy("learner.prior_policy", learner.prior_policy, *shape, world.allowed)
     horizon = steps_of(env, cfg.evaluation.horizon)
-    return Problem(env, world.source, prior, world.mdp, world.episode, horizon, cfg.env.name)
+    return Problem(env, world.source, prior, world.mdp, world.episode, horizon, cfg.env.name, ActionMasks(*shape))
 
 
 def steps_of(env: gym.Env[Any, Any], horizon: int) -> int:

@@ -23,7 +23,15 @@ NODES: dict[str, type[FloatNode | IntegerNode | BooleanNode | StringNode]] = {
     "bool": BooleanNode,
     "str": StringNode,
 }
-OF_EVERY_ENV = {"use_model": True, "on_end": "restart", "bins": None, "low": None, "high": None, "actions": None}
+OF_EVERY_ENV = {
+    "use_model": True,
+    "use_action_mask": False,
+    "on_end": "restart",
+    "bins": None,
+    "low": None,
+    "high": None,
+    "actions": None,
+}
 
 
 def resolve(path: object, key: str) -> type:

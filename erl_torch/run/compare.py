@@ -37,7 +37,7 @@ from erl_torch.checks import InputError
 from erl_torch.experience.collect import collect
 from erl_torch.experience.sources import Simulate
 from erl_torch.files import read_npy, write_json, write_png
-from erl_torch.learners.learner import StreamLearner
+from erl_torch.learners.learner import StreamLearner, with_prior
 from erl_torch.learners.s1 import kernels
 from erl_torch.mdp.tabular import TabularMDP, check_policy
 from erl_torch.notes import collected
@@ -133,7 +133,7 @@ def compare(
         n_episodes, episode_length: the stream of a seed is n_episodes * episode_length tuples.
         seeds: a number (0, 1, ...) or the seeds themselves; the streams are those of ``collect`` with that seed.
         behaviour_policy: [S, A]; None is the prior.
-        prior_policy: [S, A], entries > 0; None is uniform.
+        prior_policy: [S, A], 0 where an action is not to be taken; None is uniform.
         n_sizes: sizes of experience on the learning curve, evenly spaced in logarithms from 1000 tuples to all.
         processes: at work at once; only ``seconds`` depends on it.
         report: called with (fits done, fits in all).
@@ -152,12 +152,13 @@ def compare(
     }.items():
         checks.at_least(key, value, 1)
     checks.workers("processes", processes)
-    prior = check_policy("prior_policy", prior_policy, mdp.n_states, mdp.n_actions)
+    prior = check_policy("prior_policy", prior_policy, mdp.n_states, mdp.n_actions, mdp.allowed)
+    learners = {name: with_prior(learner, mdp.allowed) for name, learner in learners.items()}
     beta = learners[names[0]].beta
     for name, learner in learners.items():
         if learner.beta != beta:
             raise InputError(f"{name}: beta", learner.beta, f"that of {names[0]}, {beta:g}: one objective for all")
-        its = check_policy(f"{name}: prior_policy", learner.prior_policy, mdp.n_states, mdp.n_actions)
+        its = check_policy(f"{name}: prior_policy", learner.prior_policy, mdp.n_states, mdp.n_actions, mdp.allowed)
         if not np.allclose(its, prior, rtol=0, atol=1e-12):
             raise InputError(f"{name}: prior_policy", "array", "the prior of the comparison: one objective for all")
     best = solve_optimum(mdp, beta, prior)

@@ -61,7 +61,7 @@ def _array(key: str, value: object, depth: int) -> Any:
     """An array or a model; None of anything else."""
     if isinstance(value, TabularMDP):
         p = value.transition
-        parts = (p.indptr, p.indices, p.data, value.reward, value.start)
+        parts = (p.indptr, p.indices, p.data, value.reward, value.start, value.allowed)
         return f"{value.n_states} states, {value.n_actions} actions, {_sha256(parts)}"
     if isinstance(value, torch.Tensor):
         value = value.detach().cpu().numpy()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,7 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from erl_torch import checks
 from erl_torch.checks import InputError
-from erl_torch.experience.play import draw_action, episode, reset
+from erl_torch.experience.play import Draws, episode, reset
 from erl_torch.files import write_gif
 from erl_torch.learners.replicas import ReplicaSolution
 from erl_torch.mdp.from_gymnasium import sizes
@@ -111,20 +110,19 @@ def episodes(
 
     ``n_shown`` steps of the first episode are rendered, in the environment's render mode.
     """
-    cdf = np.cumsum(policy, axis=1)
     checks.memory("n_episodes", n_episodes, 17 * n_episodes, "the returns and lengths of all episodes")
     returns, lengths, ended = np.zeros(n_episodes), np.zeros(n_episodes, np.int64), np.zeros(n_episodes, bool)
     shown: list[Any] = []
     evaluation = streams(seed).evaluation
     for i in range(n_episodes):
         (rng,) = evaluation.spawn(1)
-        s = reset(env, rng)
+        first, draw = reset(env, rng), Draws(policy, rng)
         if i == 0 and n_shown:
             shown.append(env.render())
             if isinstance(shown[0], np.ndarray):
                 most = min(n_shown, horizon)
                 checks.memory("n_steps", n_shown, shown[0].nbytes * most, f"{most:,} pictures")
-        for step in episode(env, s, partial(draw_action, cdf, rng), horizon):
+        for step in episode(env, first, draw, horizon):
             returns[i] += step.r
             lengths[i] += 1
             ended[i] = step.terminated

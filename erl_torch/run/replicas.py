@@ -374,13 +374,14 @@ def reservations_of(
     """(notes on what streams do not allow the learners, what theta is to be held against); each stream is read once.
     Theta is not held against the model's."""
     shape = prior.shape
+    model = None if model is None else model.restricted(prior > 0)
 
     def data_of(here: Counted, learner: StreamLearner[Any, Any]) -> Data:
         return Data(here.tally.reward_range, of_data(here.model, learner.beta, prior) if certify else None)
 
     if isinstance(experience, Simulation):  # of the model itself: it is not held against the model
         behaviour = experience.behaviour_policy
-        rewards = float(experience.mdp.reward.min()), float(experience.mdp.reward.max())
+        rewards = experience.mdp.restricted(prior > 0).reward_range
         own = reservations.of_rewards(*rewards)
         if learners[0].drawn_from_prior == "a" and behaviour is not None:
             table = check_policy("experience.behaviour_policy", behaviour, prior.shape[0], prior.shape[1])

@@ -15,17 +15,18 @@ import yaml
 from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.envs.tabular import TabularEnv
-from erl_torch.experience.experience import EXPERIENCE, Experience
+from erl_torch.experience.experience import EXPERIENCE, Experience, permitted
 from erl_torch.experience.simulation import ReplicaExperience, Simulation, digest, longest
 from erl_torch.experience.sources import Source
 from erl_torch.experience.transitions import Transitions
 from erl_torch.files import alone
-from erl_torch.learners.learner import CONTRACT, Table, TabularLearner
+from erl_torch.learners.learner import CONTRACT, Table, TabularLearner, as_told, with_prior
 from erl_torch.learners.replicas import Replicas, ReplicaSolution
 from erl_torch.log.tensorboard import hyperparameters
 from erl_torch.mdp.from_gymnasium import known_mdp, sizes
+from erl_torch.mdp.masks import ActionMasks
 from erl_torch.mdp.tabular import TabularMDP, check_policy
-from erl_torch.notes import Note, collected
+from erl_torch.notes import Note, collected, note
 from erl_torch.problem import Problem
 from erl_torch.rng import streams
 from erl_torch.run.build import accepted, steps_of
@@ -151,6 +152,7 @@ def _trained(
     one = _checked(learner, experience, settings, checkpoint_every)
     many = isinstance(learner, Replicas)
     given = _problem(problem, one.prior_policy, settings.horizon)
+    learner = with_prior(learner, given.allowed)
     learner.start(given)  # raises where the learner cannot learn this problem
     checksum = None if isinstance(experience, Source) else digest(experience)
     described = _described(learner, given, experience, seed, settings) | {"digest": checksum}
@@ -166,6 +168,8 @@ def _trained(
     vary: dict[str, list[Any]] = {}
     if many:
         experience, seeds = _of_replicas(learner, given, experience, seed)
+        learner, given = as_told(learner, given)
+        experience = learner.permitted(experience, given.n_states, given.n_actions, note)
         learner.check(experience, given.n_states, given.n_actions)
         groups, vary = groups_among(learner.learners)
         recorder = ReplicaRecorder(learner, given, experience, groups, seeds, vary, settings, title, lambda: None)
@@ -177,6 +181,8 @@ def _trained(
         n_skipped = 0
         if experience is not None:
             experience, n_skipped = accepted(experience)
+            learner, given = as_told(learner, given)
+            experience = permitted(experience, given.prior, learner.drawn_from_prior == "a_next", note)
         rng = streams(seed).evaluation
         recorder = SingleRecorder(learner, given, experience, settings, rng, title, n_skipped)
         n_experience = 0 if experience is None else len(experience)
@@ -234,15 +240,16 @@ def _checked(
 def _problem(given: Given, prior_policy: Table, horizon: int) -> Problem:
     """As a ``Problem``, with the prior of the learner. Raises InputError."""
     if isinstance(given, Problem):
-        prior = check_policy("learner.prior_policy", prior_policy, given.n_states, given.n_actions)
-        return replace(given, prior=prior)
+        prior = check_policy("learner.prior_policy", prior_policy, given.n_states, given.n_actions, given.allowed)
+        return replace(given, prior=prior, masks=ActionMasks(given.n_states, given.n_actions))
     if isinstance(given, TabularMDP):
-        prior = check_policy("learner.prior_policy", prior_policy, given.n_states, given.n_actions)
+        prior = check_policy("learner.prior_policy", prior_policy, given.n_states, given.n_actions, given.allowed)
         return Problem(TabularEnv(given), given, prior, given, horizon=horizon, name="mdp")
     checks.instance("problem", given, gym.Env, "an environment of Gymnasium's, a TabularMDP or a Problem")
-    prior = check_policy("learner.prior_policy", prior_policy, *sizes(given))
+    mdp, shape = known_mdp(given), sizes(given)
+    prior = check_policy("learner.prior_policy", prior_policy, *shape, None if mdp is None else mdp.allowed)
     name = given.spec.id if given.spec is not None else type(given.unwrapped).__name__
-    return Problem(given, given, prior, known_mdp(given), horizon=steps_of(given, horizon), name=name)
+    return Problem(given, given, prior, mdp, None, steps_of(given, horizon), name, ActionMasks(*shape))
 
 
 def _of_replicas(

@@ -109,8 +109,9 @@ class SingleRecorder:
         noted = reservations.of_stream(self.counts, self.learner, self.problem.prior)
         if self.model is not None:
             bounds = None if self.optimum is None else self.optimum.theta_bounds
-            noted += reservations.of_model(self.counts, self.model, self.estimate, bounds)
-            noted += reservations.of_states(self.counts.tally, self.model)
+            model = self.model.restricted(self.problem.prior > 0)
+            noted += reservations.of_model(self.counts, model, self.estimate, bounds)
+            noted += reservations.of_states(self.counts.tally, model)
         return noted
 
     def _measure(self, policy: Policy) -> Evaluation:

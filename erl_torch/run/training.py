@@ -21,14 +21,14 @@ from omegaconf import DictConfig, OmegaConf
 
 from erl_torch import checks
 from erl_torch.checks import InputError
-from erl_torch.experience.experience import Experience
+from erl_torch.experience.experience import Experience, permitted
 from erl_torch.experience.simulation import digest, longest
-from erl_torch.learners.learner import TabularLearner
+from erl_torch.learners.learner import TabularLearner, as_told, with_prior
 from erl_torch.learners.replicas import Replicas
 from erl_torch.learners.s1 import kernels
 from erl_torch.log.tensorboard import hyperparameters
 from erl_torch.mdp.from_gymnasium import sizes
-from erl_torch.notes import collected
+from erl_torch.notes import collected, note
 from erl_torch.problem import Problem
 from erl_torch.rng import streams
 from erl_torch.run.build import (
@@ -51,7 +51,8 @@ from erl_torch.run.report import Title
 from erl_torch.run.settings import check_keys
 from erl_torch.run.single import SingleRecorder
 
-Parts = tuple[Any, Any, Any, dict[str, Any]]  # of a run: learner, experience, recorder, hyperparameters besides
+# Of a run: learner, problem, experience, recorder, hyperparameters besides.
+Parts = tuple[Any, Problem, Any, Any, dict[str, Any]]
 
 
 def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lambda: None) -> dict[str, Any]:
@@ -93,8 +94,10 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
     with collected() as notes, contextlib.closing(make_env(cfg.env)) as env:
         world = make_world(cfg.env, env, safe_point)
         learner = make_learner(cfg.learner, *sizes(env))
+        if world.allowed is not None:
+            learner = with_prior(learner, world.allowed)
         problem = make_problem(cfg, env, world, learner)
-        learner, experience, recorder, more = (_replicas if many else _single)(
+        learner, problem, experience, recorder, more = (_replicas if many else _single)(
             cfg, learner, problem, settings, safe_point
         )
         run: Run[Any, Any, Any] = Run(
@@ -142,10 +145,12 @@ def _single(
     n_skipped = 0
     if not learner.needs_model:
         experience, n_skipped = make_experience(make_source(cfg.experience), problem, cfg.seed, safe_point)
+        learner, problem = as_told(learner, problem)
+        experience = permitted(experience, problem.prior, learner.drawn_from_prior == "a_next", note)
         safe_point()
     title = Title(cfg.env.name, cfg.learner.name, cfg.seed)
     recorder = SingleRecorder(learner, problem, experience, settings, streams(cfg.seed).evaluation, title, n_skipped)
-    return learner, experience, recorder, {"n_experience": 0 if experience is None else len(experience)}
+    return learner, problem, experience, recorder, {"n_experience": 0 if experience is None else len(experience)}
 
 
 # -- replicas -----------------------------------------------------------------------------------------
@@ -171,10 +176,13 @@ def _replicas(
     replicas = Replicas(tuple(learners), cfg.threads or os.cpu_count() or 1)
     seeds = [cfg.seed + i for _ in groups for i in range(cfg.n_replicas)]
     experience = make_replica_experience(cfg, make_source(cfg.experience), problem, seeds, safe_point)
+    replicas, problem = as_told(replicas, problem)
+    experience = replicas.permitted(experience, problem.n_states, problem.n_actions, note)
     title = Title(cfg.env.name, cfg.learner.name, cfg.seed)
     recorder = ReplicaRecorder(replicas, problem, experience, groups, seeds, vary, settings, title, safe_point)
     varied = {f"vary.{key}": values for key, values in vary.items()}
-    return replicas, experience, recorder, {"n_replicas": cfg.n_replicas, "n_experience": longest(experience)} | varied
+    sizes_told = {"n_replicas": cfg.n_replicas, "n_experience": longest(experience)}
+    return replicas, problem, experience, recorder, sizes_told | varied
 
 
 def _with(learner: Any, group: Group) -> Any:  # a dataclass of the user's choice

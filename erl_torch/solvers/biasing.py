@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike
 
 from erl_torch import checks
 from erl_torch.checks import InputError
-from erl_torch.mdp.tabular import TabularMDP
+from erl_torch.mdp.tabular import TabularMDP, check_prior
 from erl_torch.solution import Solution, Status
 from erl_torch.solvers import kernels
 from erl_torch.solvers.certificates import soft_backup
@@ -90,6 +90,7 @@ def solve_biasing(
     checks.one_of("stop", stop, ("certificate", "kl"))
     checks.positive("tol", tol)
     problem, source = _problems(mdp, beta, prior_policy, target)
+    prior_policy = check_prior("prior_policy", prior_policy, mdp.n_states, mdp.n_actions, mdp.allowed)
     message = _no_eigenvector(problem, source)
     if message:
         solution = reducible_solution(target or mdp, problem, prior_policy)
@@ -211,6 +212,8 @@ def _problems(
     if target.reward.shape != mdp.reward.shape:
         raise InputError("target", f"MDP of shape {target.reward.shape}", f"of the shape of mdp, {mdp.reward.shape}")
     problem = BellmanProblem.of(target, beta, prior_policy)
+    if not np.array_equal(target.allowed, mdp.allowed):
+        raise InputError("target", "MDP", "one whose states have the same actions as those of mdp")
     if not np.array_equal(problem.states, source.states):
         raise InputError("target", "MDP", "one whose start leads to the same states as that of mdp")
     return problem, source
@@ -229,16 +232,18 @@ def _eigenvector(
     problem: BellmanProblem, value: np.ndarray, pattern: NewtonPattern | None, ref: int
 ) -> tuple[np.ndarray, tuple[float, float], Status, int]:
     """Right eigenvector of M_V as its logarithm, with bounds on beta G(V)."""
-    log_weight = problem.beta * (problem.action_value(value) - value[:, None])
+    with np.errstate(divide="ignore"):  # of pairs that there are not, which have no entries
+        log_prior = np.log(problem.prior)
+    log_weight = problem.beta * (problem.action_value(value) - value[:, None]) + log_prior
     if pattern is not None:
-        eigenvector = pattern.eigenvector(log_weight + np.log(problem.prior), ref, RTOL, MAX_NEWTON_STEPS)
+        eigenvector = pattern.eigenvector(log_weight, ref, RTOL, MAX_NEWTON_STEPS)
         if eigenvector is not None:
             h, bounds, steps = eigenvector
             return h, bounds, Status.CONVERGED, steps
 
     ptr, ind, slot = problem.pattern
     log_m, p = np.empty(len(ind)), problem.transition
-    kernels.merge_log_weights(p.indptr, np.log(p.data), log_weight + np.log(problem.prior), slot, ptr, log_m)
+    kernels.merge_log_weights(p.indptr, np.log(p.data), log_weight, slot, ptr, log_m)
     start = np.zeros(problem.n_states)
     terms = int(np.diff(ptr).max()) + problem.n_actions
     return solve_log_perron(ptr, ind, log_m, start, RTOL, MAX_NEWTON_STEPS, terms, elimination=problem.elimination)
@@ -251,4 +256,6 @@ def _kl_to(problem: BellmanProblem, at: BellmanProblem, tilted: np.ndarray) -> n
     wanted = np.asarray(problem.transition[rows, p.indices]).ravel()
     with np.errstate(divide="ignore", invalid="ignore"):
         terms = np.where(tilted > 0, tilted * np.log(tilted / wanted), 0.0)
-    return np.asarray(np.add.reduceat(terms, p.indptr[:-1]))
+    kl, filled = np.zeros(p.shape[0]), np.diff(p.indptr) > 0
+    kl[filled] = np.add.reduceat(terms, p.indptr[:-1][filled])
+    return kl

@@ -105,9 +105,14 @@ def tilt_rows(indptr, indices, data, h, log_mean, kl, tilted):
     """For each row: log_mean = log sum_j p_j exp(h_j), tilted_j = p_j exp(h_j - log_mean), and
     kl = sum_j tilted_j log(tilted_j / p_j).
 
-    CSR rows of positive entries; h [n_columns] of any size. Fills log_mean, kl [rows] and tilted (as data).
+    CSR rows of positive entries; h [n_columns] of any size. Fills log_mean, kl [rows] and tilted (as data). Empty rows,
+    of pairs that there are not, get 0.
     """
     for row in range(indptr.size - 1):
+        if indptr[row] == indptr[row + 1]:
+            log_mean[row] = 0.0
+            kl[row] = 0.0
+            continue
         top = -np.inf
         for m in range(indptr[row], indptr[row + 1]):
             top = max(top, h[indices[m]])

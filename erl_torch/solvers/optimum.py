@@ -19,7 +19,7 @@ class Optimum(NamedTuple):
 
     theta: float  # reward per step
     policy: np.ndarray  # [S, A]
-    log_policy: np.ndarray  # [S, A], finite also where the policy underflows
+    log_policy: np.ndarray  # [S, A], -inf where the prior is 0; finite also where the policy underflows
     stationary: np.ndarray  # [S], of that policy
 
 
@@ -35,9 +35,10 @@ def solve_optimum(mdp: TabularMDP, beta: float, prior_policy: ArrayLike | None =
     assert solution.theta is not None
     assert solution.action_value is not None
     assert solution.value is not None
-    prior = check_policy("prior_policy", prior_policy, mdp.n_states, mdp.n_actions)
+    prior = check_policy("prior_policy", prior_policy, mdp.n_states, mdp.n_actions, mdp.allowed)
     policy = solution.policy.numpy()
-    log_policy = np.log(prior) + beta * (solution.action_value - solution.value[:, None]).numpy()
+    with np.errstate(divide="ignore"):
+        log_policy = np.log(prior) + beta * (solution.action_value - solution.value[:, None]).numpy()
     return Optimum(
         solution.theta, policy, log_policy, stationary_distribution(policy_chain(mdp, policy).transition, mdp.start)
     )

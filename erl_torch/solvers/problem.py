@@ -3,6 +3,9 @@
     TV(s) = (1/beta) log sum_a prior(a|s) exp(beta (r(s,a) + E_{s'|s,a} V(s')))
 
 is its soft Bellman backup; ``erl_torch.solvers.certificates`` has the bounds that V and TV prove.
+
+A pair with prior 0 is no pair of the problem: its term of TV is 0 whatever its reward and row are, and a policy that
+takes it has KL infinite. Its row is empty and its reward 0 here, so that it is in no graph and no range.
 """
 
 from __future__ import annotations
@@ -29,16 +32,18 @@ class BellmanProblem:
     states: np.ndarray  # [n] the original states, ascending
     transition: sp.csr_array  # [n*A, n]
     reward: np.ndarray  # [n, A]
-    prior: np.ndarray  # [n, A]
+    prior: np.ndarray  # [n, A]; 0 where the state does not have the action
     start: np.ndarray  # [n]
     beta: float
 
     @classmethod
     def of(cls, mdp: TabularMDP, beta: float, prior_policy: ArrayLike | None = None) -> BellmanProblem:
-        """Restrict ``mdp``. Raises InputError for beta <= 0 or a prior that is 0 somewhere."""
+        """Restrict ``mdp``, also to the pairs with prior > 0. Raises InputError for beta <= 0, or a prior that is not
+        one of the actions that ``mdp`` has."""
         checks.instance("mdp", mdp, TabularMDP, "a TabularMDP")
         beta = checks.temperature("beta", beta)
-        prior = check_prior("prior_policy", prior_policy, mdp.n_states, mdp.n_actions)
+        prior = check_prior("prior_policy", prior_policy, mdp.n_states, mdp.n_actions, mdp.allowed)
+        mdp = mdp.restricted(prior > 0)
         p, n_actions = mdp.transition, mdp.n_actions
         mask = reachable_from(state_graph(p, n_actions), mdp.start)
         states = np.flatnonzero(mask)
@@ -58,7 +63,12 @@ class BellmanProblem:
     @cached_property
     def reward_range(self) -> float:
         """max r - min r, or max |r| if that is 0, or 1."""
-        return float(np.ptp(self.reward)) or float(np.abs(self.reward).max()) or 1.0
+        return float(np.ptp(self.rewards)) or float(np.abs(self.rewards).max()) or 1.0
+
+    @property
+    def rewards(self) -> np.ndarray:
+        """Those of the pairs with prior > 0, flat."""
+        return np.asarray(self.reward[self.prior > 0])
 
     def scale_seen(self, policy: np.ndarray, bounds: tuple[float, float]) -> float:
         """What tolerances refer to, reward per step: max(|theta|, long-run mean of |r| under ``policy`` [n, A]).
@@ -66,7 +76,7 @@ class BellmanProblem:
         Rewards that the policy never meets do not count. Where both are 0 (or theta may be, by its ``bounds``), the
         scale is the smallest |r| that is not 0.
         """
-        if np.ptp(self.reward) == 0:
+        if np.ptp(self.rewards) == 0:
             return self.reward_range
         seen = max(bounds[0], -bounds[1], 0.0)
         # Where the class falls apart in double precision, theta alone counts.
@@ -74,7 +84,7 @@ class BellmanProblem:
             share = self.regeneration(policy).stationary()
             seen = max(seen, float(share @ (policy * np.abs(self.reward)).sum(1)))
         if not seen > 0:
-            size = np.abs(self.reward)
+            size = np.abs(self.rewards)
             seen = float(size[size > 0].min(initial=np.inf))
         return seen
 
@@ -96,7 +106,7 @@ class BellmanProblem:
         return classes(state_graph(self.transition, self.n_actions))
 
     def action_value(self, value: np.ndarray) -> np.ndarray:
-        """r + E V, [n, A]."""
+        """r + E V, [n, A]; 0 where the prior is 0."""
         return np.asarray(self.reward + (self.transition @ value).reshape(self.reward.shape))
 
     @cached_property

@@ -44,8 +44,10 @@ def exact_solution(
     backed_up, policy = soft_backup(q, problem.prior, beta)
     theta = 0.5 * (bounds[0] + bounds[1])
     gap = policy_gap(problem, policy, bounds, value)
+    prior = check_policy("prior_policy", prior_policy, mdp.n_states, mdp.n_actions)
+    there = prior > 0
     # log u = beta V + log(pi/prior), so Q = log(u)/beta = V + q - TV.
-    action_value = value[:, None] + q - backed_up[:, None]
+    action_value = np.where(there[problem.states], value[:, None] + q - backed_up[:, None], -np.inf)
     shift = max(action_value.max(), value.max())
     action_value, value = action_value - shift, value - shift
     log_psi = -beta * value
@@ -54,10 +56,9 @@ def exact_solution(
     with np.errstate(over="ignore", under="ignore"):
         u, psi = np.exp(beta * action_value), np.exp(log_psi)
         rho = None if status is Status.REDUCIBLE else float(np.exp(-beta * (theta + delta)))
-    prior = check_policy("prior_policy", prior_policy, mdp.n_states, mdp.n_actions)
     return Solution(
         policy=spread(problem, policy, prior),
-        u=spread(problem, u, np.ones_like(prior)),
+        u=spread(problem, u, there.astype(np.float64)),
         psi=spread(problem, psi, np.ones(mdp.n_states)),
         rho=rho,
         theta=None if status is Status.REDUCIBLE else theta,
@@ -68,7 +69,7 @@ def exact_solution(
         message=message,
         beta=beta,
         value=spread(problem, value, np.zeros(mdp.n_states)),
-        action_value=spread(problem, action_value, np.zeros_like(prior)),
+        action_value=spread(problem, action_value, np.where(there, 0.0, -np.inf)),
         theta_bounds=bounds,
         gap=gap,
         k=k,

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from erl_torch import checks
-from erl_torch.mdp.tabular import TabularMDP, check_policy
+from erl_torch.mdp.tabular import TabularMDP, check_policy, check_prior
 from erl_torch.solution import Solution
 from erl_torch.solvers.certificates import soft_backup
 from erl_torch.solvers.chains import RegenerativeLU, SingularChainError
@@ -61,7 +61,7 @@ def solve_soft_bellman(
     Args:
         mdp: the problem, on the states that its start leads to.
         beta: inverse temperature, 1/reward, > 0.
-        prior_policy: [S, A], entries > 0; None is uniform.
+        prior_policy: [S, A], 0 where an action is not to be taken; None is uniform over the actions of each state.
         tol: width of the bounds at which to stop, relative to max(|theta|, mean |r| that the policy meets in the long
             run) or, where that is less, the range of the rewards.
         max_steps: linear systems at most.
@@ -75,7 +75,9 @@ def solve_soft_bellman(
     Raises:
         InputError: beta, prior or tol out of range.
     """
-    return solve_problem(BellmanProblem.of(mdp, beta, prior_policy), mdp, prior_policy, tol, max_steps)
+    problem = BellmanProblem.of(mdp, beta, prior_policy)
+    prior = check_prior("prior_policy", prior_policy, mdp.n_states, mdp.n_actions, mdp.allowed)
+    return solve_problem(problem, mdp, prior, tol, max_steps)
 
 
 def solve_problem(
@@ -116,7 +118,7 @@ def certify(
     problem = BellmanProblem.of(mdp, beta, prior_policy)
     bounds = (best or solve_soft_bellman(mdp, beta, prior_policy)).theta_bounds
     assert bounds is not None
-    policy = check_policy("policy", solution.policy, mdp.n_states, mdp.n_actions)[problem.states]
+    policy = check_policy("policy", solution.policy, mdp.n_states, mdp.n_actions, mdp.allowed)[problem.states]
     return replace(solution, theta_bounds=bounds, gap=policy_gap(problem, policy, bounds), beta=beta)
 
 

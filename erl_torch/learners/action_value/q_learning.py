@@ -23,7 +23,8 @@ The first two solve the problem of this package, V + g = (1/beta) log sum_a pi0 
 first visit of a pair (a_n = 1) then moves q all the way and g not at all.
 
 a' of the stream is not used, and any behaviour policy with support will do. Where an action has never been taken in
-a state, V is that of the others, and the action keeps its prior share in the policy.
+a state, V is that of the others, and the action keeps its prior share in the policy. Where the prior is 0 the state
+does not have the action: tuples that take it are left out.
 
 Steps need 1/2 < power <= 1 to converge; near 1 they forget too slowly what early values got wrong.
 """
@@ -67,12 +68,14 @@ class ActionValueState:
 
     @property
     def action_value(self) -> torch.Tensor:
-        """q where visited; elsewhere the soft value of the state's visited actions, or 0 if it has none: [S, A]."""
-        seen = self.visits > 0
+        """q where visited; elsewhere the soft value of the state's visited actions, or 0 if it has none; -inf where the
+        prior is 0: [S, A]."""
+        there = self.prior_policy > 0
+        seen = (self.visits > 0) & there
         logits = torch.where(seen, self.beta * self.q + self.prior_policy.log(), -torch.inf)
         mass = (self.prior_policy * seen).sum(1).log()
         value = torch.where(seen.any(1), (logits.logsumexp(1) - mass) / self.beta, 0.0)
-        return torch.where(seen, self.q, value[:, None])
+        return torch.where(there, torch.where(seen, self.q, value[:, None]), -torch.inf)
 
     @property
     def policy(self) -> torch.Tensor:
@@ -87,9 +90,10 @@ class ActionValueState:
     def metrics(self) -> dict[str, float]:
         """The scalars that are logged; no theta where there is none."""
         known = {} if self.theta is None else {"theta": self.theta}
+        q = self.q[self.prior_policy > 0]
         return known | {
-            "q_min": float(self.q.min()),
-            "q_max": float(self.q.max()),
+            "q_min": float(q.min()),
+            "q_max": float(q.max()),
             "epoch": self.epoch,
             "n_tuples": self.n_tuples,
         }
@@ -112,7 +116,7 @@ class ActionValueLearner(StreamLearner[ActionValueState, ActionValueStream]):
         beta: inverse temperature, 1/reward, > 0.
         power: of the step n(s,a)**-power, in (1/2, 1].
         n_epochs: passes over the stream; the clocks run on.
-        prior_policy: [S, A], rows sum to 1 and every entry > 0; None is uniform.
+        prior_policy: [S, A], rows sum to 1, 0 where a state does not have the action; None is uniform.
 
     Raises:
         InputError: an argument out of its range.

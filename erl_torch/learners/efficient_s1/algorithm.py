@@ -39,6 +39,7 @@ Options, each alone (published: all off, ``unvisited="initial"``; then this *is*
                             V and pi are the state's own: its policy's loss there is not above that. Off: all passes.
     9. ``unvisited``        "exclude": the problem is that of ``erl_torch.empirical.counts``: pairs never visited have
                             probability 0, states outside keep the prior. "initial": u = 1 of line 7.
+                            Pairs with prior 0 take no part either way, nor do tuples that have them.
 The self-loop and the clip of rho are those of ``ListedS1`` (``self_loop="new"``, ``clip_rho``).
 
 Online (``online``): one pass over a stream without end, no tuple kept: tables of S*A numbers, and the counts
@@ -288,7 +289,7 @@ class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
             else.
         n_epochs: passes over the stream a biasing iteration. Short ones serve best where u is carried over.
         n_bias: biasing iterations at most, the unbiased first included.
-        prior_policy: [S, A], every entry > 0; None is uniform.
+        prior_policy: [S, A], 0 where a state does not have the action; None is uniform.
         tol: width at which the certificate ends the run, relative to the range of the rewards.
         clock_horizon, clock_floor: of the clocks; h >= 1, floor in (0, 1].
         phase_growth: of the online mode, > 1.
@@ -516,7 +517,7 @@ class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
             model=model,
             part=part,
             weight=torch.from_numpy(weight),
-            inside=part.used if self.unvisited == "exclude" else np.ones_like(part.used),
+            inside=part.used if self.unvisited == "exclude" else prior > 0,
             visited=visited,
             psi_rows=(np.append(indptr[visited], len(values)), indices, values),
             log_keep=log_keep,
@@ -587,6 +588,12 @@ class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
         """
         checks.instance("chunk", chunk, Transitions, "Transitions")
         chunk.check_range(*state.log_z.shape)
+        there = state.prior_policy.numpy() > 0
+        if not there.all():
+            taken = there[chunk.s, chunk.a]
+            if not taken.any():
+                return replace(state, epoch=state.epoch + 1)
+            chunk = chunk if taken.all() else chunk.where(taken)
         done = 0
         while done < len(chunk):
             stop = min(len(chunk), done + state.phase_end - state.n_tuples)
@@ -748,7 +755,7 @@ class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
         tables = {name: getattr(state, name).copy() for name in names}
         log_z = state.log_z.numpy().copy()
         lr_rho = self.lr_u / n_states if self.lr_rho is None else self.lr_rho
-        with np.errstate(over="ignore", invalid="ignore"):
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             log_rho, log_rho_max = kernels.online_phase(
                 pair,
                 data.s_next,

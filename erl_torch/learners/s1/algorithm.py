@@ -58,6 +58,8 @@ which made the published Figure 5; ``ListedS1`` is the same class with the listi
 10. Rewards that vary for the same (s,a) are used as they come: S1 averages exp(beta r), and is
    optimistic about that noise.
 11. Delta is the maximum over the pairs that occur.
+12. A pair with prior 0 is an action that the state does not have: its u is 0, and it has no part in the scale of u.
+    Tuples that take one, or lead to one as a', are left out.
 """
 
 from __future__ import annotations
@@ -94,7 +96,7 @@ class S1State:
     beta: float
     rho: float
     prior_policy: torch.Tensor  # [S, A]
-    u: torch.Tensor  # [S, A], mean 1
+    u: torch.Tensor  # [S, A], mean 1; 0 where the prior is 0
     psi: torch.Tensor  # [S], line 12 of this u
     psi_in_use: torch.Tensor  # [S], behind the present biases
     mean_psi: torch.Tensor  # [S, A]
@@ -183,7 +185,7 @@ class AlgorithmS1(StreamLearner[S1State, S1Stream]):
         n_bias: biasing iterations, the unbiased first included.
         psi_tol: relative error between epochs that ends a psi phase.
         max_psi_epochs: limit on the epochs of a psi phase.
-        prior_policy: [S, A], rows sum to 1 and every entry > 0; None is uniform.
+        prior_policy: [S, A], rows sum to 1, 0 where a state does not have the action; None is uniform.
         rho_init: "carry" (line 8 only in the first biasing iteration: the script) or "reset" (in each: the listing).
         self_loop: which u(s',a') line 11 sees where (s',a') = (s,a): "old" (the script) or "new" (the listing).
         clip_rho: keep rho <= max(1, exp(beta max r)).
@@ -293,7 +295,7 @@ class AlgorithmS1(StreamLearner[S1State, S1Stream]):
             beta=self.beta,
             rho=rho,
             prior_policy=torch.from_numpy(prior).to(self.device),
-            u=table + 1,
+            u=table + torch.from_numpy(prior > 0).to(self.device),
             psi=torch.ones(n_states, dtype=torch.float64, device=self.device),
             psi_in_use=torch.ones(n_states, dtype=torch.float64, device=self.device),
             mean_psi=table + 1,
@@ -342,8 +344,9 @@ class AlgorithmS1(StreamLearner[S1State, S1Stream]):
             if done < len(stream.data):
                 raise self._failure(state, stream, done)
             visited = stream.visited if self.unvisited == "prior" else None
-            u, psi = line_12(u, state.prior_policy.cpu().numpy(), visited)
-            if not (positive(u).all() and positive(psi).all()):
+            prior = state.prior_policy.cpu().numpy()
+            u, psi = line_12(u, prior, visited)
+            if not (positive(u[prior > 0]).all() and positive(psi).all()):
                 raise NonFiniteError(
                     n_tuples, f"u spans more than double precision holds at beta={self.beta:g}: lower beta"
                 )
@@ -379,7 +382,7 @@ class AlgorithmS1(StreamLearner[S1State, S1Stream]):
             psi_epochs=epochs,
             psi_error=error,
             psi_converged=state.psi_converged and error < self.psi_tol,
-            u=torch.ones_like(state.u),  # line 7
+            u=(state.prior_policy > 0).double(),  # line 7
             rho=math.exp(-self.beta) if reset else state.rho,  # line 8
         )
 
@@ -447,6 +450,7 @@ class AlgorithmS1(StreamLearner[S1State, S1Stream]):
             state.mean_log_psi.cpu().numpy(),
             psi,
             self.beta,
+            state.prior_policy.cpu().numpy(),
         )
         z = state.u.cpu().numpy() * psi[:, None]
         g, table = g.reshape(-1), z.reshape(-1)  # views: the kernel writes into z
@@ -555,11 +559,19 @@ def reward_biases(mean_psi: np.ndarray, mean_log_psi: np.ndarray, beta: float | 
 
 
 def gains(
-    reward: np.ndarray, reward_bias: np.ndarray, mean_log_psi: np.ndarray, psi: np.ndarray, beta: float | np.ndarray
+    reward: np.ndarray,
+    reward_bias: np.ndarray,
+    mean_log_psi: np.ndarray,
+    psi: np.ndarray,
+    beta: float | np.ndarray,
+    prior: np.ndarray,
 ) -> np.ndarray:
-    """g [..., S, A] of the gauge z = psi u; psi [..., S] is the one behind the biases."""
+    """g [..., S, A] of the gauge z = psi u; psi [..., S] is the one behind the biases. -1 marks pairs with prior 0, for
+    the kernels: no tuple has them, and their z = 0 is no sign of an underflow."""
     largest = reward_bias.max((-2, -1), keepdims=True)  # line 6
-    return np.exp(beta * (reward - largest) - mean_log_psi + np.log(psi)[..., None])  # type: ignore[no-any-return]
+    g = np.exp(beta * (reward - largest) - mean_log_psi + np.log(psi)[..., None])
+    g[..., prior == 0] = -1.0
+    return g  # type: ignore[no-any-return]
 
 
 def line_12(u: np.ndarray, prior: np.ndarray, visited: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
@@ -572,6 +584,6 @@ def line_12(u: np.ndarray, prior: np.ndarray, visited: np.ndarray | None) -> tup
         weight = prior * visited
         mass = weight.sum(-1, keepdims=True)
         mean = np.where(mass > 0, (weight * u).sum(-1, keepdims=True) / mass, u)
-        u = np.where(visited, u, mean)
+        u = np.where(visited | (prior == 0), u, mean)
     u = u / u.reshape(*u.shape[:-2], -1).mean(-1)[..., None, None]
     return u, 1 / (prior * u).sum(-1)

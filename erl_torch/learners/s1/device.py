@@ -69,7 +69,8 @@ def u_phase(
                 z_now[k] = z_new
                 q_now = torch.maximum(q_new, q_min)  # keeps NaN
         table = z_now.view(-1, n)
-        healthy = (torch.isfinite(table) & (table > 0)).all(0) & torch.isfinite(q_now) & (q_now > 0)
+        good = (torch.isfinite(table) & (table > 0)) | (gain_of.view(-1, n) < 0)  # g < 0: no pair, z is 0
+        healthy = good.all(0) & torch.isfinite(q_now) & (q_now > 0)
         bad = torch.where(~healthy & (bad < 0), t, bad)
         table = torch.where(healthy, table, z_before.view(-1, n))
         q_now = torch.where(healthy, q_now, q_before)

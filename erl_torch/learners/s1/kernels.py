@@ -128,11 +128,12 @@ def _u_chunk(pair, pair_next, factor, noisy, g, z, inv_rho, lr_u, lr_rho, inv_rh
 
 
 @numba.njit(cache=True, error_model="numpy", nogil=True)
-def _is_healthy(z, q):
+def _are_healthy(z, g, q):
+    """Whether all are positive finite numbers; z of a pair that there is not (g < 0) is 0."""
     if not (np.isfinite(q) and q > 0.0):
         return False
     for k in range(z.size):
-        if not (np.isfinite(z[k]) and z[k] > 0.0):
+        if not (np.isfinite(z[k]) and z[k] > 0.0) and not g[k] < 0.0:
             return False
     return True
 
@@ -141,7 +142,8 @@ def _is_healthy(z, q):
 def u_epoch(
     pair, pair_next, factor, noisy, g, z, inv_rho, lr_u, lr_rho, inv_rho_min, new, rescale_every, begin, end, first=0
 ):
-    """Lines 9-11 over tuples begin..end of a pass; z [n_pairs] changes in place.
+    """Lines 9-11 over tuples begin..end of a pass; z [n_pairs] changes in place. Where there is no such pair, z is 0, g
+    is below 0, and no tuple has it.
 
     ``first``: tuple of the pass that stands first in the columns.
 
@@ -158,7 +160,7 @@ def u_epoch(
         backup[:] = z
         q_before = q
         q = _u_chunk(pair, pair_next, factor, noisy, g, z, q, lr_u, lr_rho, inv_rho_min, new, t - first, stop - first)
-        if not _is_healthy(z, q):
+        if not _are_healthy(z, g, q):
             z[:] = backup
             q = q_before
             for bad in range(t - first, stop - first):
@@ -217,7 +219,7 @@ def _shared_rows(pair, pair_next, factor, noisy, g, z, q, lr_u, lr_rho, inv_rho_
 
 
 @numba.njit(cache=True, error_model="numpy", nogil=True)
-def _settle(z, q, z_before, q_before, failed, step_k, step_lane, rescale, began):
+def _settle(z, g, q, z_before, q_before, failed, step_k, step_lane, rescale, began):
     """After a stretch that began at tuple ``began``: lanes that left the numbers go back, the others are rescaled.
 
     ``failed`` [lanes] gets the stretch in which a lane first left, -1 before.
@@ -227,9 +229,9 @@ def _settle(z, q, z_before, q_before, failed, step_k, step_lane, rescale, began)
         healthy = np.isfinite(q[i]) and q[i] > 0.0
         total = 0.0
         for n in range(n_pairs):
-            x = z[n * step_k + i * step_lane]
-            healthy = healthy and np.isfinite(x) and x > 0.0
-            total += x
+            k = n * step_k + i * step_lane
+            healthy = healthy and ((np.isfinite(z[k]) and z[k] > 0.0) or g[k] < 0.0)
+            total += z[k]
         if not healthy:
             if failed[i] < 0:
                 failed[i] = began
@@ -263,7 +265,7 @@ def lanes_epoch(
             pair, pair_next, factor, noisy, g, z, q, lr_u, lr_rho, inv_rho_min, new, step_k, step_lane, t - begin,
             stop - begin,
         )  # fmt: skip
-        _settle(z, q, z_before, q_before, failed, step_k, step_lane, stop % rescale_every == 0, t)
+        _settle(z, g, q, z_before, q_before, failed, step_k, step_lane, stop % rescale_every == 0, t)
         t = stop
 
 
@@ -279,7 +281,7 @@ def shared_epoch(
         _shared_rows(
             pair, pair_next, factor, noisy, g, z, q, lr_u, lr_rho, inv_rho_min, new, t - begin, stop - begin,
         )  # fmt: skip
-        _settle(z, q, z_before, q_before, failed, q.size, 1, stop % rescale_every == 0, t)
+        _settle(z, g, q, z_before, q_before, failed, q.size, 1, stop % rescale_every == 0, t)
         t = stop
 
 
@@ -305,7 +307,7 @@ def sampled_epoch(
             _lanes_rows(
                 pair, pair_next, factor, False, g, z, q, lr_u, lr_rho, inv_rho_min, new, step_k, step_lane, 0, n
             )
-        _settle(z, q, z_before, q_before, failed, step_k, step_lane, stop % rescale_every == 0, t)
+        _settle(z, g, q, z_before, q_before, failed, step_k, step_lane, stop % rescale_every == 0, t)
         t = stop
 
 

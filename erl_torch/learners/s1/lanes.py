@@ -221,7 +221,7 @@ class Engine:
             beta=self.beta,
             prior_policy=starts[0].prior_policy.cpu(),
             rho=np.array([start.rho for start in starts]),
-            u=table + 1,
+            u=table + (self.prior > 0),
             psi=np.ones((n, self.n_states)),
             psi_in_use=np.ones((n, self.n_states)),
             mean_psi=table + 1,
@@ -464,7 +464,7 @@ class Engine:
                 good &= positive(state.mean_psi).all((1, 2)) & np.isfinite(state.reward_bias).all((1, 2))
             u, rho, whole = self._u_phase(state, lanes, pool)
             u, psi = line_12(u, self.prior, lanes.visited if self.learner.unvisited == "prior" else None)
-            good &= whole & positive(u).all((1, 2)) & positive(psi).all(1)
+            good &= whole & (positive(u) | (self.prior == 0)).all((1, 2)) & positive(psi).all(1)
             after = replace(
                 state, epoch=state.epoch + 1, n_tuples=state.n_tuples + lanes.n_tuples, rho=rho, u=u, psi=psi
             )
@@ -513,7 +513,7 @@ class Engine:
             psi_epochs=epochs,
             psi_error=error,
             psi_converged=state.psi_converged & (error < self.learner.psi_tol),
-            u=np.ones_like(state.u),  # line 7
+            u=np.zeros_like(state.u) + (self.prior > 0),  # line 7
             rho=np.array([math.exp(-beta) for beta in self.beta]) if reset else state.rho,  # line 8
         )
 
@@ -522,7 +522,7 @@ class Engine:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(u [R, S, A], rho [R], whether all numbers stayed positive and finite [R]) after lines 9-11."""
         beta = self.beta[:, None, None]
-        g = gains(lanes.reward, state.reward_bias, state.mean_log_psi, state.psi_in_use, beta)
+        g = gains(lanes.reward, state.reward_bias, state.mean_log_psi, state.psi_in_use, beta, self.prior)
         z = state.u * state.psi_in_use[:, :, None]
         g, z = (x.reshape(len(self.replicas), self.n_pairs) for x in (g, z))
         q = 1 / state.rho
