@@ -12,7 +12,7 @@ import difflib
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cached_property
-from typing import Any, Protocol, TypeGuard
+from typing import Any, NamedTuple, Protocol, TypeGuard
 
 import gymnasium as gym
 import numpy as np
@@ -25,6 +25,22 @@ Label = Any  # int | str | tuple[Label, ...] | dict[str, Label]: mypy has no rec
 
 ALLOWED = "a whole number, a text, or a tuple or dict of such"
 MOST = 2**31 - 1  # states or actions: tuples hold them in 32 bits
+
+
+class Names(NamedTuple):
+    """What texts for people call states and actions."""
+
+    states: Labels | None = None  # None: their numbers
+    actions: Labels | None = None
+
+    def state(self, s: int, symbol: str = "s") -> str:
+        return f"{symbol}={s if self.states is None else self.states.text(int(s))}"
+
+    def pair(self, s: int, a: int) -> str:
+        return f"{self.state(s)}, a={a if self.actions is None else self.actions.text(int(a))}"
+
+
+NUMBERS = Names()
 
 
 class Labels:

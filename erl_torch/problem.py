@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 
+from erl_torch.labels import Labels, Names
 from erl_torch.mdp.tabular import TabularMDP
 
 Policy: TypeAlias = torch.Tensor
@@ -27,6 +28,7 @@ class Problem:
         episode: the model of one episode: its end is absorbed, without reward; None where there is none.
         horizon: steps of an episode at most, >= 1.
         name: what messages and pictures call it.
+        state_labels, action_labels: what states and actions are called; None: their numbers.
     """
 
     env: gym.Env[Any, Any]
@@ -36,6 +38,8 @@ class Problem:
     episode: TabularMDP | None = None
     horizon: int = 1000
     name: str = "the environment"
+    state_labels: Labels | None = None
+    action_labels: Labels | None = None
 
     @property
     def n_states(self) -> int:
@@ -44,3 +48,7 @@ class Problem:
     @property
     def n_actions(self) -> int:
         return int(self.prior.shape[1])
+
+    @property
+    def names(self) -> Names:
+        return Names(self.state_labels, self.action_labels)

@@ -25,6 +25,7 @@ FLOORS = (
 BESIDE = {
     ("files", "checks"),
     ("labels", "checks"),
+    ("pictures", "labels"),
     ("rng", "checks"),
     ("log", "checks"),
     ("solution", "mdp"),

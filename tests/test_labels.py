@@ -1,7 +1,5 @@
 """Labels: numbers of states and actions, and back; spaces against Gymnasium's own ``contains`` and ``sample``."""
 
-from __future__ import annotations
-
 import itertools
 import math
 
@@ -46,7 +44,7 @@ LABELS = st.recursive(
 )
 
 
-def size_by_hand(space: gym.Space) -> int:
+def size_by_hand(space):
     """How many members, from the definition of each space."""
     match space:
         case spaces.Discrete():
@@ -65,7 +63,7 @@ def size_by_hand(space: gym.Space) -> int:
 
 @settings(max_examples=60, deadline=None)
 @given(SPACES)
-def test_numbers_of_a_space_are_one_to_one(space: gym.Space) -> None:
+def test_numbers_of_a_space_are_one_to_one(space):
     labels = Labels.of_space(space)
     assert len(labels) == size_by_hand(space)
     members = [labels.member(i) for i in range(len(labels))]
@@ -84,7 +82,7 @@ def test_numbers_of_a_space_are_one_to_one(space: gym.Space) -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(SPACES, st.integers(1, 4))
-def test_a_batch_is_its_members_one_by_one(space: gym.Space, n: int) -> None:
+def test_a_batch_is_its_members_one_by_one(space, n):
     labels = Labels.of_space(space)
     batch = gym.vector.utils.batch_space(space, n)
     batch.seed(0)
@@ -93,7 +91,7 @@ def test_a_batch_is_its_members_one_by_one(space: gym.Space, n: int) -> None:
     assert labels.encode_batch(values, n).tolist() == one_by_one
 
 
-def test_the_last_entry_counts_fastest() -> None:
+def test_the_last_entry_counts_fastest():
     space = spaces.Tuple((spaces.Discrete(2, start=1), spaces.MultiDiscrete([2, 3])))
     expected = [(i, (j, k)) for i, j, k in itertools.product((1, 2), range(2), range(3))]
     assert list(Labels.of_space(space)) == expected
@@ -101,7 +99,7 @@ def test_the_last_entry_counts_fastest() -> None:
 
 @settings(max_examples=100, deadline=None)
 @given(st.lists(LABELS, min_size=1, max_size=8))
-def test_labels_come_back_from_their_texts(tmp_path_factory: pytest.TempPathFactory, values: list[object]) -> None:
+def test_labels_come_back_from_their_texts(tmp_path_factory, values):
     labels = Labels.of_values(values)
     path = tmp_path_factory.mktemp("labels") / "labels.npz"
     write_npz(path, {"labels": labels.texts})
@@ -112,7 +110,7 @@ def test_labels_come_back_from_their_texts(tmp_path_factory: pytest.TempPathFact
         assert labels.text(labels.encode(value)) == again.text(again.encode(value))
 
 
-def test_order_is_that_of_first_appearance_and_equal_texts_are_one_label() -> None:
+def test_order_is_that_of_first_appearance_and_equal_texts_are_one_label():
     labels = Labels.of_values(["b", 3, "a", "3", np.int64(3), 3.0, (1, "x"), [1, "x"], np.array([1, 2])])
     assert list(labels) == ["b", 3, "a", (1, "x"), (1, 2)]
     assert labels.encode("(1, 'x')") == 3
@@ -121,26 +119,26 @@ def test_order_is_that_of_first_appearance_and_equal_texts_are_one_label() -> No
     assert list(Labels.of_values(np.array([5, 2, 5, -1]))) == [5, 2, -1]
 
 
-def test_a_dict_is_one_label_in_any_order() -> None:
+def test_a_dict_is_one_label_in_any_order():
     labels = Labels.of_values([{"b": 1, "a": (2,)}])
     assert labels.encode({"a": [2], "b": 1}) == 0
     assert labels.texts.tolist() == ["{'a': (2,), 'b': 1}"]
 
 
 @pytest.mark.parametrize("column", [["x", "y", "x", "x"], np.array(["x", "y", "x", "x"]), ("x", "y", "x", "x")])
-def test_a_column_is_encoded(column: object) -> None:
+def test_a_column_is_encoded(column):
     labels = Labels.of_values(["y", "z", "x"])
-    assert labels.encode_all(column).tolist() == [2, 0, 2, 2]  # type: ignore[arg-type]
+    assert labels.encode_all(column).tolist() == [2, 0, 2, 2]
 
 
 @pytest.mark.parametrize("column", [["b", "a", "c", "c"], np.array(["b", "a", "c", "c"])])
-def test_the_first_wrong_row_of_a_column_is_named(column: object) -> None:
+def test_the_first_wrong_row_of_a_column_is_named(column):
     labels = Labels.of_values(["b"])
     with pytest.raises(InputError, match=r"^state\[1\]=a: must be one of b"):
-        labels.encode_all(column, "state")  # type: ignore[arg-type]
+        labels.encode_all(column, "state")
 
 
-def test_whole_numbers_are_taken_from_floats_and_nothing_else_is() -> None:
+def test_whole_numbers_are_taken_from_floats_and_nothing_else_is():
     labels = Labels.of_space(spaces.Discrete(3, start=1))
     assert [labels.encode(x) for x in (1, 2.0, np.float32(3), np.array(2), "3")] == [0, 1, 2, 1, 2]
     for wrong in (0, 4, 0.5, np.nan, np.inf, 2**70, None, "up", [1], np.array([1]), 1j, 1e300):
@@ -161,14 +159,14 @@ def test_whole_numbers_are_taken_from_floats_and_nothing_else_is() -> None:
         (spaces.Dict(cell=spaces.Discrete(2)), (0,), "dict with cell"),
     ],
 )
-def test_what_is_outside_its_space_is_named(space: gym.Space, wrong: object, words: str) -> None:
+def test_what_is_outside_its_space_is_named(space, wrong, words):
     with pytest.raises(InputError, match=words) as error:
         Labels.of_space(space).encode(wrong, "observation")
     assert str(error.value).startswith("observation=")
     assert "\n" not in str(error.value)
 
 
-def test_the_place_in_a_batch_is_named() -> None:
+def test_the_place_in_a_batch_is_named():
     labels = Labels.of_space(spaces.MultiDiscrete([2, 3]))
     with pytest.raises(InputError, match=r"^observation\[2\]=\[1 3\]"):
         labels.encode_batch(np.array([[0, 0], [1, 2], [1, 3]]), 3, "observation")
@@ -185,19 +183,19 @@ def test_the_place_in_a_batch_is_named() -> None:
         (spaces.Tuple((spaces.Discrete(2), spaces.Text(3))), "a finite space"),
     ],
 )
-def test_spaces_that_are_not_finite_or_too_large_are_refused(space: gym.Space, words: str) -> None:
+def test_spaces_that_are_not_finite_or_too_large_are_refused(space, words):
     with pytest.raises(InputError, match=words):
         Labels.of_space(space)
     assert len(Labels.of_space(spaces.Discrete(2**31 - 1))) == 2**31 - 1  # computed, not listed
 
 
 @pytest.mark.parametrize("wrong", [0.5, None, "a\0", "\ud800", b"a", {1: 2}, object(), (1, None)])
-def test_what_is_no_label_is_named(wrong: object) -> None:
+def test_what_is_no_label_is_named(wrong):
     with pytest.raises(InputError, match=r"^labels\[1\]="):
         Labels.of_values(["fine", wrong])
 
 
-def test_wrong_texts_and_numbers_are_named() -> None:
+def test_wrong_texts_and_numbers_are_named():
     with pytest.raises(InputError, match="0 of them"):
         Labels.of_values([])
     with pytest.raises(InputError, match="labels=a: must be there once"):
@@ -207,6 +205,6 @@ def test_wrong_texts_and_numbers_are_named() -> None:
     labels = Labels.of_values(["left", "right"])
     for number in (-1, 2, 0.5):
         with pytest.raises(InputError, match="number="):
-            labels.decode(number)  # type: ignore[arg-type]
+            labels.decode(number)
     with pytest.raises(InputError, match=r"one of left, right \(did you mean left\?\)"):
         labels.encode("lefft")

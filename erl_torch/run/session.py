@@ -18,6 +18,7 @@ import yaml
 
 from erl_torch import checks
 from erl_torch.checks import InputError
+from erl_torch.envs.encoded import encoded, labels_of
 from erl_torch.envs.tabular import TabularEnv
 from erl_torch.experience.experience import EXPERIENCE, Experience
 from erl_torch.experience.simulation import ReplicaExperience, Simulation, digest, longest
@@ -209,14 +210,19 @@ def _problem(given: Given, prior_policy: Table, horizon: int) -> Problem:
     """As a ``Problem``, with the prior of the learner. Raises InputError."""
     if isinstance(given, Problem):
         prior = check_policy("learner.prior_policy", prior_policy, given.n_states, given.n_actions)
-        return replace(given, prior=prior)
+        env = encoded(given.env)
+        states, actions = (known or own for known, own in zip(given.names, labels_of(env), strict=True))
+        source = encoded(given.source)
+        return replace(given, env=env, source=source, prior=prior, state_labels=states, action_labels=actions)
     if isinstance(given, TabularMDP):
         prior = check_policy("learner.prior_policy", prior_policy, given.n_states, given.n_actions)
         return Problem(TabularEnv(given), given, prior, given, horizon=horizon, name="mdp")
     checks.instance("problem", given, gym.Env, "an environment of Gymnasium's, a TabularMDP or a Problem")
+    given = encoded(given)
     prior = check_policy("learner.prior_policy", prior_policy, *sizes(given))
     name = given.spec.id if given.spec is not None else type(given.unwrapped).__name__
-    return Problem(given, given, prior, known_mdp(given), horizon=steps_of(given, horizon), name=name)
+    horizon = steps_of(given, horizon)
+    return Problem(given, given, prior, known_mdp(given), None, horizon, name, *labels_of(given))
 
 
 def _of_replicas(
