@@ -16,6 +16,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
 
+from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.labels import Labels
 from erl_torch.mdp.from_gymnasium import MASKED, space_labels
@@ -128,15 +129,27 @@ def encoded(source: Any) -> Any:
     return source
 
 
-def labels_of(source: object) -> tuple[Labels | None, Labels | None]:
-    """The labels of states and of actions of what ``encoded`` gave; None where they are numbers from 0."""
-    while isinstance(source, (gym.Wrapper, gym.vector.VectorWrapper)) and not isinstance(
-        source, (Encoded, EncodedVector)
-    ):
-        source = source.env
-    if not isinstance(source, (Encoded, EncodedVector)):
-        return None, None
-    return tuple(None if is_plain(one.space) else one for one in (source.state_labels, source.action_labels))  # type: ignore[return-value]
+def labels_of(env: gym.Env[Any, Any]) -> tuple[Labels | None, Labels | None]:
+    """The labels of states and of actions of what ``encoded`` gave; None where they are numbers from 0.
+
+    An environment names its own: the lists ``state_labels`` and ``action_labels`` of the environment, without wrappers.
+    Raises InputError where there are more or fewer of them than states or actions.
+    """
+    inner: Any = env
+    while isinstance(inner, gym.Wrapper) and not isinstance(inner, Encoded):
+        inner = inner.env
+    found: list[Labels | None] = []
+    for name, space in (("state_labels", env.observation_space), ("action_labels", env.action_space)):
+        given = getattr(env.unwrapped, name, None)
+        coded = getattr(inner, name) if isinstance(inner, Encoded) else None
+        if given is None:
+            found.append(None if coded is None or is_plain(coded.space) else coded)
+            continue
+        labels = Labels.of_values(checks.sequence(name, given))
+        if len(labels) != len(Labels.of_space(space)):
+            raise InputError(name, f"{len(labels)} different ones", f"one for each member of {space}")
+        found.append(labels)
+    return found[0], found[1]
 
 
 def is_plain(space: gym.Space[Any]) -> bool:

@@ -27,9 +27,10 @@ same. Entries of P with the same s' are summed. Time limits are not part of a mo
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -256,7 +257,7 @@ def _entries(table: object, env: gym.Env[Any, Any]) -> tuple[np.ndarray, ...]:
     loose: list[int] = []  # entries of three, which do not say whether the episode ends
     for s, of_state in _items("P", table, states):
         for a, entries in _items(f"P[{states.text(s)}]", of_state, actions):
-            key = f"P[{states.text(s)}][{actions.text(a)}]"
+            key = _Key(states, s, actions, a)
             for entry in _listed(key, entries):
                 probability, s_next, reward, terminated = _entry(key, entry, states)
                 if probability != 0:
@@ -276,8 +277,20 @@ def _entries(table: object, env: gym.Env[Any, Any]) -> tuple[np.ndarray, ...]:
     if wrong.size:
         s, a = divmod(int(row[wrong[0]]), len(actions))
         allowed = "one with entries, or the end of the episode (terminated true)"
-        raise InputError(f"P[{states.text(s)}][{actions.text(a)}]: s'", states.text(int(to[wrong[0]])), allowed)
+        raise InputError(f"{_Key(states, s, actions, a)}: s'", states.text(int(to[wrong[0]])), allowed)
     return row[kept], to[kept], p[kept], r[kept], end[kept]
+
+
+class _Key(NamedTuple):
+    """``P[s][a]``, written only where it is needed."""
+
+    states: Labels
+    s: int
+    actions: Labels
+    a: int
+
+    def __str__(self) -> str:
+        return f"P[{self.states.text(self.s)}][{self.actions.text(self.a)}]"
 
 
 def _items(key: str, table: object, labels: Labels) -> Iterator[tuple[int, Any]]:
@@ -299,31 +312,41 @@ def _items(key: str, table: object, labels: Labels) -> Iterator[tuple[int, Any]]
     yield from enumerate(values)
 
 
-def _listed(key: str, value: object) -> list[Any]:
+def _listed(key: str | _Key, value: object) -> Sequence[Any]:
+    if isinstance(value, (list, tuple)):
+        return value
     if value is None:
         return []
     if isinstance(value, str) or not isinstance(value, (Sequence, np.ndarray, set, frozenset, Iterator)):
-        raise InputError(key, f"{value!r} ({type(value).__name__})", "P[s][a] = [(p, s', reward, terminated), ...]")
+        raise InputError(
+            f"{key}", f"{value!r} ({type(value).__name__})", "P[s][a] = [(p, s', reward, terminated), ...]"
+        )
     return list(value) if not isinstance(value, np.ndarray) or value.ndim else [value.item()]
 
 
-def _entry(key: str, entry: object, states: Labels) -> tuple[float, int, float, bool | None]:
+def _entry(key: _Key, entry: object, states: Labels) -> tuple[float, int, float, bool | None]:
     """(probability, s', reward, terminated); None where the entry does not say. Raises InputError."""
-    values = list(entry) if isinstance(entry, (Sequence, np.ndarray)) and not isinstance(entry, str) else []
+    values = entry
+    if not isinstance(values, (tuple, list)):
+        values = list(values) if isinstance(values, (Sequence, np.ndarray)) and not isinstance(values, str) else []
     if len(values) not in (3, 4):
-        raise InputError(key, f"{entry!r}", "a list of (p, s', reward, terminated)")
+        raise InputError(f"{key}", f"{entry!r}", "a list of (p, s', reward, terminated)")
     try:
         p, r = float(values[0]), float(values[2])
     except (TypeError, ValueError) as error:
-        raise InputError(key, f"{entry!r}", "a list of (p, s', reward, terminated), of numbers") from error
-    if not 0 <= p < np.inf:
+        raise InputError(f"{key}", f"{entry!r}", "a list of (p, s', reward, terminated), of numbers") from error
+    if not 0 <= p < math.inf:
         raise InputError(f"{key}: probability", p, "finite and >= 0")
-    if p != 0 and not (np.isfinite(r) or r == -np.inf):
+    if p != 0 and not r < math.inf:
         raise InputError(f"{key}: reward", r, "finite, or -inf for an action that the state does not have")
     end = values[3] if len(values) == 4 else None
-    if not isinstance(end, (bool, int, float, np.bool_, np.number, type(None))):
+    if type(end) is not bool and not isinstance(end, (int, float, np.bool_, np.number, type(None))):
         raise InputError(f"{key}: terminated", f"{end!r}", "True or False")
-    return p, states.encode(values[1], f"{key}: s'"), r, None if end is None else bool(end)
+    try:
+        s_next = states.encode(values[1])
+    except InputError as error:
+        raise InputError(f"{key}: s'", error.value, error.allowed) from error
+    return p, s_next, r, None if end is None else bool(end)
 
 
 def _missing(row: np.ndarray, n_states: int, n_actions: int) -> tuple[np.ndarray, np.ndarray]:
