@@ -73,7 +73,7 @@ class Labels:
     def of_space(space: gym.Space[Any]) -> SpaceLabels:
         """The members of a finite space: Discrete, MultiDiscrete, MultiBinary, a Box of bounded whole numbers, and
         Tuple and Dict of such. In the order of their entries: the last one counts fastest. A Dict's entries are in
-        the order of ``space.keys()``.
+        the order of their names.
 
         Raises:
             InputError: a space that is not finite, or one with 2**31 members or more.
@@ -366,7 +366,7 @@ class _Product:
 
     def decode(self, number: int) -> Label:
         items = [part.decode(i) for part, i in zip(self.parts, self._numbers(number), strict=True)]
-        return tuple(items) if self.names is None else dict(sorted(zip(self.names, items, strict=True)))
+        return tuple(items) if self.names is None else dict(zip(self.names, items, strict=True))
 
     def member(self, number: int) -> Any:
         items = [part.member(i) for part, i in zip(self.parts, self._numbers(number), strict=True)]
@@ -396,6 +396,7 @@ def _part(space: gym.Space[Any]) -> _Part:
     if isinstance(space, spaces.Tuple):
         return _Product([_part(part) for part in space.spaces], None)
     if isinstance(space, spaces.Dict):
-        return _Product([_part(part) for part in space.spaces.values()], list(space.spaces))
+        names = sorted(space.spaces)  # files and Gymnasium order them in several ways
+        return _Product([_part(space.spaces[name]) for name in names], names)
     allowed = "a finite space: Discrete, MultiDiscrete, MultiBinary, a Box of whole numbers, or Tuple and Dict of such"
     raise InputError("space", space, allowed)

@@ -95,6 +95,10 @@ def test_the_last_entry_counts_fastest():
     space = spaces.Tuple((spaces.Discrete(2, start=1), spaces.MultiDiscrete([2, 3])))
     expected = [(i, (j, k)) for i, j, k in itertools.product((1, 2), range(2), range(3))]
     assert list(Labels.of_space(space)) == expected
+    parts = {"b": spaces.Discrete(2), "a": spaces.Discrete(3)}
+    for one in (spaces.Dict(**parts), spaces.Dict(parts), spaces.Dict(dict(reversed(parts.items())))):
+        named = [{"a": i, "b": j} for i, j in itertools.product(range(3), range(2))]
+        assert list(Labels.of_space(one)) == named
 
 
 @settings(max_examples=100, deadline=None)
