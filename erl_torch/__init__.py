@@ -29,6 +29,7 @@ _PUBLIC = {
     "learners.learner": "Learner NonFiniteError State StreamLearner",
     "learners.replicas": "Replicas ReplicaSolution",
     "learners.s1.algorithm": "AlgorithmS1 ListedS1 S1State",
+    "labels": "Labels",
     "mdp.from_gymnasium": "MeanRewardWarning tabular_mdp",
     "mdp.masks": "ActionMasks",
     "mdp.tabular": "TabularMDP",

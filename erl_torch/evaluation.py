@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from erl_torch import checks
 from erl_torch.checks import InputError
+from erl_torch.envs.encoded import encoded
 from erl_torch.experience import kernels as experience_kernels
 from erl_torch.experience.collect import batched
 from erl_torch.experience.play import Draws, Plan, episode, reset
@@ -67,6 +68,7 @@ def evaluate(
     n_episodes, horizon = checks.at_least("n_episodes", n_episodes, 1), checks.at_least("horizon", horizon, 1)
     checks.memory("n_episodes", n_episodes, 8 * n_episodes, "the returns of all episodes")
     checks.instance("rng", rng, np.random.Generator, "a generator, as numpy.random.default_rng(0)")
+    source = encoded(source)
     n_states, n_actions = sizes(source)
     if mdp is not None:
         checks.instance("mdp", mdp, TabularMDP, "a TabularMDP")

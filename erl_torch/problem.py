@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 
+from erl_torch.labels import Labels, Names
 from erl_torch.mdp.masks import ActionMasks
 from erl_torch.mdp.tabular import TabularMDP
 
@@ -29,6 +30,7 @@ class Problem:
         horizon: steps of an episode at most, >= 1.
         name: what messages and pictures call it.
         masks: where the actions of each state are noted, as ``env`` tells them; None where it does not.
+        state_labels, action_labels: what states and actions are called; None: their numbers.
     """
 
     env: gym.Env[Any, Any]
@@ -39,6 +41,8 @@ class Problem:
     horizon: int = 1000
     name: str = "the environment"
     masks: ActionMasks | None = None
+    state_labels: Labels | None = None
+    action_labels: Labels | None = None
 
     @property
     def allowed(self) -> np.ndarray:
@@ -57,3 +61,7 @@ class Problem:
     @property
     def n_actions(self) -> int:
         return int(self.prior.shape[1])
+
+    @property
+    def names(self) -> Names:
+        return Names(self.state_labels, self.action_labels)

@@ -12,7 +12,7 @@ from helpers import ended
 ROOT = Path(__file__).parents[1] / "erl_torch"
 # From the ground up; a folder may import from those on lines above its own.
 FLOORS = (
-    {"lazy", "checks", "configurations", "notes", "output", "rng", "files", "parallel", "pictures", "log"},
+    {"lazy", "checks", "configurations", "labels", "notes", "output", "rng", "files", "parallel", "pictures", "log"},
     {"solution", "mdp", "problem"},
     {"envs", "solvers"},
     {"experience"},
@@ -24,6 +24,8 @@ FLOORS = (
 )
 BESIDE = {
     ("files", "checks"),
+    ("labels", "checks"),
+    ("pictures", "labels"),
     ("rng", "checks"),
     ("log", "checks"),
     ("solution", "mdp"),

@@ -132,7 +132,7 @@ def test_environments(cliff, tmp_path, capsys, env, n_states, n_actions, render)
     run = copy(cliff, tmp_path / "run", np.full((n_states, n_actions), 1 / n_actions), f"env={env}")
     played = play(arguments(f"run={run}", "n_episodes=1", f"render={render}", "n_steps=2"))
     if env == "mountain_car":
-        assert "mountain_car has no text to show; render=gif draws it" in capsys.readouterr().out
+        assert "mountain_car has no text of its own to show; render=gif draws it" in capsys.readouterr().out
     elif render != "none":
         assert len(played.shown) == 3
     assert len(list(run.glob("*.gif"))) == (render == "gif")

@@ -42,7 +42,7 @@ from erl_torch.learners.s1.lanes import LanesState, can_interleave, interleave
 from erl_torch.learners.together import Together, check_learner
 from erl_torch.mdp.tabular import check_policy
 from erl_torch.problem import Problem
-from erl_torch.solution import Solution
+from erl_torch.solution import LABELS, Solution
 
 
 class ReplicaState(Protocol):
@@ -94,6 +94,8 @@ class ReplicaSolution:
         if name not in {f.name for f in fields(Solution)}:
             raise AttributeError(name)
         values = [getattr(solution, name) for solution in self.solutions]
+        if name in LABELS:  # which all share
+            return values[0]
         if isinstance(values[0], torch.Tensor):
             return torch.stack(values)
         if isinstance(values[0], float):
@@ -103,24 +105,26 @@ class ReplicaSolution:
     def save(self, path: str | os.PathLike[str], more: Mapping[str, np.ndarray] | None = None) -> Path:
         """Write all solutions to one npz file: the arrays of ``Solution.save`` with a leading axis [R], and ``more``.
 
-        Histories stay out: they end where their replica did.
+        Histories stay out: they end where their replica did. Labels, which all share, are there once.
         """
         rows = [solution.arrays(history=False) for solution in self.solutions]
+        shared = {name: rows[0].pop(name) for name in LABELS if name in rows[0]}
         names = {name for row in rows for name in row}
         whole = {name: np.stack([row[name] for row in rows]) for name in sorted(names) if all(name in r for r in rows)}
-        return write_npz(path, whole | dict(more or {}))
+        return write_npz(path, whole | shared | dict(more or {}))
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> ReplicaSolution:
         """Read what ``save`` wrote. Raises InputError naming the file."""
         arrays = read_npz(path)
-        known = [f.name for f in fields(Solution) if f.name in arrays]
+        shared = {name: arrays[name] for name in LABELS if name in arrays}
+        known = [f.name for f in fields(Solution) if f.name in arrays and f.name not in shared]
         if "policy" not in known:
             raise InputError("path", path, "the solutions of replicas as ReplicaSolution.save writes them")
         n = {len(arrays[name]) if arrays[name].ndim else -1 for name in known}
         if len(n) > 1 or -1 in n:
             raise InputError("path", path, "the solutions of replicas, as many rows in every array")
-        rows = ({name: arrays[name][r] for name in known} for r in range(n.pop()))
+        rows = ({name: arrays[name][r] for name in known} | shared for r in range(n.pop()))
         return cls(tuple(Solution.of_arrays(row, path) for row in rows))
 
 

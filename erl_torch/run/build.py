@@ -17,6 +17,7 @@ from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.envs import ENTRY_POINTS
 from erl_torch.envs.discretise import Discretise
+from erl_torch.envs.encoded import encoded, labels_of
 from erl_torch.envs.estimate import estimate_mdp
 from erl_torch.experience.collect import COLUMN_BYTES
 from erl_torch.experience.experience import EXPERIENCE, Experience
@@ -65,7 +66,10 @@ def group(name: str) -> Iterator[None]:
 
 
 def make_env(cfg: DictConfig, render_mode: str | None = None) -> gym.Env[Any, Any]:
-    """The environment of ``cfg``: its ``class``, or what Gymnasium has under its ``id``. Raises InputError."""
+    """The environment of ``cfg``: its ``class``, or what Gymnasium has under its ``id``, with both spaces Discrete.
+
+    Raises InputError.
+    """
     keys: Any = OmegaConf.to_container(cfg, resolve=True)
     with group("env"):
         kind, spec = _env_class(keys)
@@ -97,7 +101,7 @@ def make_env(cfg: DictConfig, render_mode: str | None = None) -> gym.Env[Any, An
         binning = {key: keys.get(key) for key in ("bins", "low", "high", "actions") if key not in arguments}
         if any(value is not None for value in binning.values()):
             return Discretise(env, **binning)
-        return env
+        return encoded(env)
 
 
 def _env_class(keys: dict[str, Any]) -> tuple[type | None, str | EnvSpec]:
@@ -185,7 +189,8 @@ def make_problem(cfg: DictConfig, env: gym.Env[Any, Any], world: World, learner:
     shape = sizes(env)
     prior = check_policy("learner.prior_policy", learner.prior_policy, *shape, world.allowed)
     horizon = steps_of(env, cfg.evaluation.horizon)
-    return Problem(env, world.source, prior, world.mdp, world.episode, horizon, cfg.env.name, ActionMasks(*shape))
+    masks = ActionMasks(*shape)
+    return Problem(env, world.source, prior, world.mdp, world.episode, horizon, cfg.env.name, masks, *labels_of(env))
 
 
 def steps_of(env: gym.Env[Any, Any], horizon: int) -> int:

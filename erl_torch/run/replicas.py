@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,6 +20,7 @@ from erl_torch.experience.collect import COLUMN_BYTES
 from erl_torch.experience.simulation import KEEP_BYTES, ReplicaExperience, Simulation, longest
 from erl_torch.experience.transitions import Transitions
 from erl_torch.files import write_png
+from erl_torch.labels import NUMBERS, Names
 from erl_torch.learners.learner import NonFiniteError, StreamLearner
 from erl_torch.learners.replicas import Replicas, ReplicaSolution, ReplicaState
 from erl_torch.log.quantities import with_own
@@ -80,7 +81,13 @@ class ReplicaRecorder:
         betas = [learner.beta for learner in learners]
         self.judges = Judges(self.problem, self.settings, betas, self.seeds, self.replicas.workers)
         texts, self.data = reservations_of(
-            self.experience, learners, self.problem.prior, self.judges.model, self.settings.certify, self.safe_point
+            self.experience,
+            learners,
+            self.problem.prior,
+            self.judges.model,
+            self.settings.certify,
+            self.safe_point,
+            self.problem.names,
         )
         for text in texts:
             note(text)
@@ -168,7 +175,9 @@ class ReplicaRecorder:
         board.scalars(self.recorded.final(), step)
         for text in reservations.of_replicas(self._outcomes(solution)):
             note(text)
-        return solution
+        states, actions = self.problem.names
+        named = (replace(one, state_labels=states, action_labels=actions) for one in solution.solutions)
+        return ReplicaSolution(tuple(named), solution.failures)
 
     @property
     def _n_each(self) -> int:
@@ -370,6 +379,7 @@ def reservations_of(
     model: TabularMDP | None,
     certify: bool,
     safe_point: SafePoint,
+    names: Names = NUMBERS,
 ) -> tuple[list[str], list[Data]]:
     """(notes on what streams do not allow the learners, what theta is to be held against); each stream is read once.
     Theta is not held against the model's."""
@@ -406,7 +416,7 @@ def reservations_of(
     held = []
     for learner, data in zip(learners, streams_of, strict=True):
         if id(data) not in counted:
-            counted[id(data)] = reservations.count(data, shape[0], shape[1], next_actions)
+            counted[id(data)] = reservations.count(data, shape[0], shape[1], next_actions, names)
         here = counted[id(data)]
         against = (
             [] if model is None else reservations.of_model(here, model) + reservations.of_states(here.tally, model)

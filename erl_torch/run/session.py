@@ -14,6 +14,7 @@ import yaml
 
 from erl_torch import checks
 from erl_torch.checks import InputError
+from erl_torch.envs.encoded import encoded, labels_of
 from erl_torch.envs.tabular import TabularEnv
 from erl_torch.experience.experience import EXPERIENCE, Experience, permitted
 from erl_torch.experience.simulation import ReplicaExperience, Simulation, digest, longest
@@ -240,16 +241,29 @@ def _checked(
 def _problem(given: Given, prior_policy: Table, horizon: int) -> Problem:
     """As a ``Problem``, with the prior of the learner. Raises InputError."""
     if isinstance(given, Problem):
-        prior = check_policy("learner.prior_policy", prior_policy, given.n_states, given.n_actions, given.allowed)
-        return replace(given, prior=prior, masks=ActionMasks(given.n_states, given.n_actions))
+        shape = given.n_states, given.n_actions
+        prior = check_policy("learner.prior_policy", prior_policy, *shape, given.allowed)
+        env, source = encoded(given.env), encoded(given.source)
+        states, actions = (known or own for known, own in zip(given.names, labels_of(env), strict=True))
+        return replace(
+            given,
+            env=env,
+            source=source,
+            prior=prior,
+            masks=ActionMasks(*shape),
+            state_labels=states,
+            action_labels=actions,
+        )
     if isinstance(given, TabularMDP):
         prior = check_policy("learner.prior_policy", prior_policy, given.n_states, given.n_actions, given.allowed)
         return Problem(TabularEnv(given), given, prior, given, horizon=horizon, name="mdp")
     checks.instance("problem", given, gym.Env, "an environment of Gymnasium's, a TabularMDP or a Problem")
+    given = encoded(given)
     mdp, shape = known_mdp(given), sizes(given)
     prior = check_policy("learner.prior_policy", prior_policy, *shape, None if mdp is None else mdp.allowed)
     name = given.spec.id if given.spec is not None else type(given.unwrapped).__name__
-    return Problem(given, given, prior, mdp, None, steps_of(given, horizon), name, ActionMasks(*shape))
+    horizon = steps_of(given, horizon)
+    return Problem(given, given, prior, mdp, None, horizon, name, ActionMasks(*shape), *labels_of(given))
 
 
 def _of_replicas(

@@ -100,7 +100,8 @@ class SingleRecorder:
         if self.experience is None:
             return None
         next_actions = self.learner.drawn_from_prior == "a_next"
-        return reservations.count(self.experience, self.problem.n_states, self.problem.n_actions, next_actions)
+        n_states, n_actions = self.problem.prior.shape
+        return reservations.count(self.experience, n_states, n_actions, next_actions, self.problem.names)
 
     def _reservations(self) -> list[Reservation]:
         """What the stream does not allow the learner, and where it contradicts the model."""
@@ -173,12 +174,14 @@ class SingleRecorder:
     def _draw(self, state: TabularState, position: int, title: str, board: Board) -> None:
         if not self.settings.pictures:
             return
-        grid = grid_pictures.grid_of(self.problem.env)
+        grid, names = grid_pictures.grid_of(self.problem.env), self.problem.names
         heading = f"policy, {title}" if position else title
-        board.picture("policy", grid_pictures.policy_picture(state.policy.cpu().numpy(), grid, heading), position)
+        policy = state.policy.cpu().numpy()
+        board.picture("policy", grid_pictures.policy_picture(policy, grid, heading, names=names), position)
         if position and state.reward_bias is not None:
             bias = state.reward_bias.cpu().numpy()
-            board.picture("reward_bias", grid_pictures.bias_picture(bias, grid, f"reward bias, {title}"), position)
+            heading = f"reward bias, {title}"
+            board.picture("reward_bias", grid_pictures.bias_picture(bias, grid, heading, names=names), position)
 
     def _figures(self, row: Row) -> str:
         if "theta_lower" in row:
@@ -232,7 +235,8 @@ class SingleRecorder:
         final = {"theta": solution.theta, "gap": solution.gap}
         ends = {name: value for name, value in final.items() if value is not None}
         board.scalars(tagged("Final", figures(self.last) | ends), position)
-        return solution
+        names = self.problem.names
+        return replace(solution, state_labels=names.states, action_labels=names.actions)
 
     def save(self, solution: Solution, directory: Path) -> None:
         solution.save(directory / "solution.npz")
