@@ -205,10 +205,7 @@ def vector_tuples(env: gym.vector.VectorEnv[Any, Any, Any], plan: Plan) -> Itera
     act_next = Draws(plan.prior, rng.behaviour)
     masks = plan.masks or ActionMasks(*plan.prior.shape)
     n_states = _n_states_of_each(env)
-    with _blamed(env, "reset"):
-        observation, info = _observed(env.reset(seed=_seed(rng.environment)))
-        state = _states(observation, n_states, env.num_envs)
-        _enter(masks, state, info, np.ones(env.num_envs, bool))
+    state = _reset_states(env, None, n_states, plan, masks, "reset")
     action = act.each(state, masks)
     reward = np.zeros(env.num_envs)
     restarting = np.zeros(env.num_envs, bool)  # this step is a reset: its observation a first state
@@ -232,9 +229,7 @@ def vector_tuples(env: gym.vector.VectorEnv[Any, Any, Any], plan: Plan) -> Itera
                 _enter(masks, after, info.get("final_info", {}), truncated & ~terminated)
         elif over.any() and mode == AutoresetMode.DISABLED:
             has_first |= over
-            with _blamed(env, f"reset after step {t}"):
-                observation, info = _observed(env.reset(seed=_seed(rng.environment), options={"reset_mask": over}))
-                _enter(masks, first := _states(observation, n_states, env.num_envs), info, over)
+            first = _reset_states(env, over, n_states, plan, masks, f"reset after step {t}")
         ready = (~restarting & (~terminated | has_first)) | unfinished
         after = np.where((terminated & has_first) | unfinished, first, after)
         action_next = act_next.each(after, masks)
@@ -251,6 +246,23 @@ def vector_tuples(env: gym.vector.VectorEnv[Any, Any, Any], plan: Plan) -> Itera
         action = np.where(goes_on & plan.on_prior, action_next, act.each(state, masks))
         restarting = over & ~has_first
         state, action = np.where(restarting, held_state, state), np.where(restarting, held_action, action)
+
+
+def _reset_states(
+    env: gym.vector.VectorEnv[Any, Any, Any],
+    over: np.ndarray | None,
+    n_states: int,
+    plan: Plan,
+    masks: ActionMasks,
+    when: str,
+) -> np.ndarray:
+    """Reset those of the environments whose episode is ``over`` [n], None all; the states of all, [n]."""
+    options = None if over is None else {"reset_mask": over}
+    with _blamed(env, when):
+        observation, info = _observed(env.reset(seed=_seed(plan.rng.environment), options=options))
+        states = _states(observation, n_states, env.num_envs)
+        _enter(masks, states, info, np.ones(env.num_envs, bool) if over is None else over)
+    return states
 
 
 def _enter(masks: ActionMasks, states: np.ndarray, info: Any, which: np.ndarray) -> None:
