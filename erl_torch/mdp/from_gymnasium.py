@@ -24,6 +24,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import scipy.sparse as sp
+import scipy.sparse.csgraph as csgraph
 from gymnasium import wrappers
 from numpy.typing import ArrayLike
 
@@ -136,7 +137,7 @@ def tabular_mdp(env: gym.Env[Any, Any], on_end: str = "restart", start: ArrayLik
     if mdp is not None:
         mdp = TabularMDP(mdp.transition, mdp.reward, mdp.start if start is None else start)  # type: ignore[arg-type]
         ends = np.flatnonzero(ending_states(env, mdp.n_states))
-        return mdp if on_end == "restart" else _absorbed(mdp, ends, mdp.reward[ends])
+        return mdp if on_end == "restart" else absorbed(mdp, ends, mdp.reward[ends])
     n_states, n_actions = sizes(env)
     row, to, p, r, end = _entries(_table(env), n_states, n_actions)
     n_rows = n_states * n_actions
@@ -160,11 +161,13 @@ def tabular_mdp(env: gym.Env[Any, Any], on_end: str = "restart", start: ArrayLik
     mdp = TabularMDP(
         on + sp.coo_array((p[end], (row[end], to[end])), shape=shape), mean.reshape(n_states, n_actions), first
     )
-    terminal = np.unique(to[end])
-    both = np.intersect1d(terminal, to[~end & ~np.isin(row // n_actions, terminal)])
+    # States that no episode comes to do not count: Taxi's table has rows for them too.
+    seen = _come_to(row[~end] // n_actions, to[~end], first)
+    terminal = np.setdiff1d(to[end], np.flatnonzero(seen))
+    both = np.intersect1d(to[end & seen[row // n_actions]], np.flatnonzero(seen))
     if both.size:
         raise InputError("on_end", on_end, f"restart: state {both[0]} is entered with and without an episode's end")
-    return _absorbed(mdp, terminal, np.where(absorbing(mdp)[terminal, None], mdp.reward[terminal], 0.0))
+    return absorbed(mdp, terminal, np.where(absorbing(mdp)[terminal, None], mdp.reward[terminal], 0.0))
 
 
 def absorbing(mdp: TabularMDP) -> np.ndarray:
@@ -212,7 +215,18 @@ def _start(start: ArrayLike | None, n_states: int) -> np.ndarray:
     return distribution
 
 
-def _absorbed(mdp: TabularMDP, states: np.ndarray, reward: np.ndarray) -> TabularMDP:
+def _come_to(origin: np.ndarray, to: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """[S] bool: states that moves from ``origin`` to ``to``, [n] each, lead to from the support of ``start`` [S]."""
+    n, sources = len(start), np.flatnonzero(start > 0)
+    # One search from one more state, with a move to every source.
+    rows, columns = np.append(origin, np.full(len(sources), n)), np.append(to, sources)
+    graph = sp.csr_array((np.ones(len(rows), np.int8), (rows, columns)), shape=(n + 1, n + 1))
+    seen = np.zeros(n + 1, bool)
+    seen[csgraph.breadth_first_order(graph, n, return_predecessors=False)] = True
+    return seen[:n]
+
+
+def absorbed(mdp: TabularMDP, states: np.ndarray, reward: np.ndarray | float) -> TabularMDP:
     """``mdp`` with ``states`` never left and the given rewards, [n] or [n, A], there."""
     among = np.zeros(mdp.n_states, bool)
     among[states] = True
