@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -30,6 +30,7 @@ from numpy.typing import ArrayLike
 
 from erl_torch import checks
 from erl_torch.checks import InputError
+from erl_torch.mdp.ends import Failures, Rule, with_end_reward
 from erl_torch.mdp.tabular import TabularMDP, normalise_rows
 
 Table = Mapping[int, Mapping[int, Sequence[tuple[float, int, float, bool]]]]  # P, as it should be
@@ -114,32 +115,53 @@ def _own_start(env: gym.Env[Any, Any]) -> ArrayLike | None:
 # -- the model ----------------------------------------------------------------------------------------------
 
 
-def tabular_mdp(env: gym.Env[Any, Any], on_end: str = "restart", start: ArrayLike | None = None) -> TabularMDP:
+class Ends(NamedTuple):
+    """How the steps of a model end episodes; all [S, A]."""
+
+    ended: np.ndarray  # the probability that the step ends the episode
+    failed: np.ndarray  # that it ends it in failure
+
+
+def tabular_mdp(
+    env: gym.Env[Any, Any],
+    on_end: str = "restart",
+    start: ArrayLike | None = None,
+    end_reward: float = 0.0,
+    failures: Rule = "default",
+) -> TabularMDP:
     """The model of an environment that has one; see the module's docstring.
 
     Args:
         env: with Discrete spaces, and ``P`` or ``mdp``, without a wrapper that changes the process.
         on_end: "restart" or "absorb".
         start: [S], the start distribution; None is the environment's own.
+        end_reward: added to the reward of the steps that end an episode: a charge, < 0, of those that fail, or a bonus,
+            > 0, of the others.
+        failures: the rule that says which ends are failures (``erl_torch.mdp.ends``).
 
     Raises:
-        InputError: no model, a table that is not as above, or a model that leaves out part of the process.
+        InputError: no model, a table that is not as above, a model that leaves out part of the process, or an
+            end_reward that no end gets.
 
     Warns:
         MeanRewardWarning: rewards depend on s'.
     """
     checks.one_of("on_end", on_end, ("restart", "absorb"))
-    checks.instance("env", env, gym.Env, "an environment of Gymnasium's")
-    changed = changed_by(env)
-    if changed is not None:
-        raise InputError("env", env, f"without {changed}, under which the model is not known")
+    _check_known(env)
     mdp = known_mdp(env)
     if mdp is not None:
-        mdp = TabularMDP(mdp.transition, mdp.reward, mdp.start if start is None else start)  # type: ignore[arg-type]
-        ends = np.flatnonzero(ending_states(env, mdp.n_states))
-        return mdp if on_end == "restart" else absorbed(mdp, ends, mdp.reward[ends])
+        reward = mdp.reward
+        if end_reward:
+            ends = model_ends(env, failures)
+            reward = with_end_reward(reward, ends.ended, ends.failed, end_reward)
+        mdp = TabularMDP(mdp.transition, reward, mdp.start if start is None else start)  # type: ignore[arg-type]
+        last = np.flatnonzero(ending_states(env, mdp.n_states))
+        return mdp if on_end == "restart" else absorbed(mdp, last, mdp.reward[last])
     n_states, n_actions = sizes(env)
     row, to, p, r, end = _entries(_table(env), n_states, n_actions)
+    if end_reward:
+        failed = _failures(failures, r, end, n_states).among(r, to) & end
+        r = with_end_reward(r, end, failed, end_reward)
     n_rows = n_states * n_actions
     first = _start(_own_start(env) if start is None else start, n_states)
     mean = np.bincount(row, p * r, n_rows)
@@ -168,6 +190,50 @@ def tabular_mdp(env: gym.Env[Any, Any], on_end: str = "restart", start: ArrayLik
     if both.size:
         raise InputError("on_end", on_end, f"restart: state {both[0]} is entered with and without an episode's end")
     return absorbed(mdp, terminal, np.where(absorbing(mdp)[terminal, None], mdp.reward[terminal], 0.0))
+
+
+def model_ends(env: gym.Env[Any, Any], failures: Rule = "default") -> Ends:
+    """How the steps of an environment that has a model end episodes.
+
+    Raises:
+        InputError: no model, or a rule that cannot be used.
+    """
+    _check_known(env)
+    mdp = known_mdp(env)
+    if mdp is not None:
+        ends = ending_states(env, mdp.n_states)
+        over = np.repeat(ends[:, None], mdp.n_actions, 1)
+        rule = _failures(failures, mdp.reward, over, mdp.n_states)
+        state = np.repeat(np.arange(mdp.n_states)[:, None], mdp.n_actions, 1)
+        return Ends(over.astype(np.float64), (over & rule.among(mdp.reward, state)).astype(np.float64))
+    n_states, n_actions = sizes(env)
+    row, to, p, r, end = _entries(_table(env), n_states, n_actions)
+    failed = _failures(failures, r, end, n_states).among(r, to) & end
+    chances = (np.bincount(row[x], p[x], n_states * n_actions).reshape(n_states, n_actions) for x in (end, failed))
+    return Ends(*chances)
+
+
+def best_end(env: gym.Env[Any, Any]) -> float | None:
+    """The largest reward of a step that ends an episode, where the environment tells; -infinite if none ends one."""
+    if changed_by(env) is None:
+        mdp = known_mdp(env)
+        if mdp is not None:
+            return float(mdp.reward[ending_states(env, mdp.n_states)].max(initial=-np.inf))
+        if has_table(env):
+            _, _, _, r, end = _entries(_table(env), *sizes(env))
+            return float(r[end].max(initial=-np.inf))
+    return None
+
+
+def _failures(rule: Rule, reward: np.ndarray, end: np.ndarray, n_states: int) -> Failures:
+    return Failures.of(rule, float(reward[end].max(initial=-np.inf)), n_states)
+
+
+def _check_known(env: gym.Env[Any, Any]) -> None:
+    checks.instance("env", env, gym.Env, "an environment of Gymnasium's")
+    changed = changed_by(env)
+    if changed is not None:
+        raise InputError("env", env, f"without {changed}, under which the model is not known")
 
 
 def absorbing(mdp: TabularMDP) -> np.ndarray:
