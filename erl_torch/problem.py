@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 
+from erl_torch.mdp.ends import EndRule
 from erl_torch.mdp.tabular import TabularMDP
 
 Policy: TypeAlias = torch.Tensor
@@ -27,6 +28,9 @@ class Problem:
         episode: the model of one episode: its end is absorbed, without reward; None where there is none.
         horizon: steps of an episode at most, >= 1.
         name: what messages and pictures call it.
+        success: [S, A], the probability that a step of the episode's model ends it in success; None where not known.
+        ends: which ends are failures, and what is added to their rewards where ``env`` is learnt from; None where
+            episodes do not end, or that is not known.
     """
 
     env: gym.Env[Any, Any]
@@ -36,6 +40,8 @@ class Problem:
     episode: TabularMDP | None = None
     horizon: int = 1000
     name: str = "the environment"
+    success: np.ndarray | None = None
+    ends: EndRule | None = None
 
     @property
     def n_states(self) -> int:

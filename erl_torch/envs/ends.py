@@ -8,7 +8,7 @@ import gymnasium as gym
 
 from erl_torch import checks
 from erl_torch.checks import InputError
-from erl_torch.mdp.ends import Failures, Rule
+from erl_torch.mdp.ends import EndRule, Failures, Rule
 from erl_torch.mdp.from_gymnasium import best_end, sizes
 
 
@@ -31,18 +31,17 @@ class EndReward(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs
     def __init__(self, env: gym.Env[Any, Any], end_reward: float, failures: Rule = "default") -> None:
         gym.utils.RecordConstructorArgs.__init__(self, end_reward=end_reward, failures=failures)
         super().__init__(env)
-        self.end_reward = checks.finite("end_reward", end_reward)
-        self.rule = Failures.of(failures, best_end(env), sizes(env)[0])
-        if end_reward < 0 and self.rule.limit == -float("inf") and not self.rule.states:
+        rule = Failures.of(failures, best_end(env), sizes(env)[0])
+        self.rule = EndRule(rule, checks.finite("end_reward", end_reward))
+        if end_reward < 0 and rule.limit == -float("inf") and not rule.states:
             raise InputError("end_reward", end_reward, "0, or a bonus > 0: no end is a failure by this rule")
-        if end_reward > 0 and self.rule.limit == float("inf"):
+        if end_reward > 0 and rule.limit == float("inf"):
             raise InputError("end_reward", end_reward, "0, or a charge < 0: every end is a failure by this rule")
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         observation, reward, terminated, truncated, info = self.env.step(action)
         if terminated:
-            failed = bool(self.rule.among(reward, observation))
+            failed, more = self.rule.of(float(reward), int(observation))
             info = {**info, "failure": failed}
-            if failed == (self.end_reward < 0):
-                reward = float(reward) + self.end_reward
+            reward = float(reward) + more
         return observation, float(reward), terminated, truncated, info

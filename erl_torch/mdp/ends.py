@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -38,7 +38,7 @@ UNPAID = float(np.nextafter(0.0, 1.0))  # a step that pays less than this pays a
 
 @dataclass(frozen=True)
 class Failures:
-    """A rule for one environment: the ends in ``states``, or, where that is None, those that pay less than ``limit``."""
+    """A rule for one environment: the ends in ``states``; where that is None, those that pay less than ``limit``."""
 
     limit: float
     states: tuple[int, ...] | None = None
@@ -58,7 +58,9 @@ class Failures:
         checks.one_of("failures", rule, RULES)
         if rule == "default":
             if best is None:
-                allowed = "unpaid, all, none, or a list of states: this environment does not tell beforehand how it ends"
+                allowed = (
+                    "unpaid, all, none, or a list of states: the environment does not tell beforehand how it ends"
+                )
                 raise InputError("failures", rule, allowed)
             return cls(min(best, UNPAID))
         return cls({"unpaid": UNPAID, "all": np.inf, "none": -np.inf}[rule])
@@ -68,6 +70,18 @@ class Failures:
         if self.states is not None:
             return np.asarray(np.isin(np.asarray(state), self.states))
         return np.asarray(np.asarray(reward) < self.limit)
+
+
+class EndRule(NamedTuple):
+    """What the ends of an environment's episodes count."""
+
+    failures: Failures
+    end_reward: float = 0.0
+
+    def of(self, reward: float, state: int) -> tuple[bool, float]:
+        """(whether the end is a failure, what is added to the reward of its step)."""
+        failed = bool(self.failures.among(reward, state))
+        return failed, self.end_reward if failed == (self.end_reward < 0) else 0.0
 
 
 def failing_ends(
@@ -89,7 +103,7 @@ def failing_ends(
     if not r.shape == over.shape == s.shape or r.ndim != 1:
         raise InputError("terminated", f"array of shape {over.shape}", f"of the shape of reward and state, {r.shape}")
     best = float(r[over].max()) if over.any() else -np.inf
-    return over & Failures.of(failures, best, n_states).among(r, s)
+    return np.asarray(over & Failures.of(failures, best, n_states).among(r, s))
 
 
 def with_end_reward(reward: ArrayLike, ended: ArrayLike, failed: ArrayLike, end_reward: float) -> np.ndarray:

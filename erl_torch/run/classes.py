@@ -23,7 +23,8 @@ NODES: dict[str, type[FloatNode | IntegerNode | BooleanNode | StringNode]] = {
     "bool": BooleanNode,
     "str": StringNode,
 }
-OF_EVERY_ENV = {"use_model": True, "on_end": "restart", "bins": None, "low": None, "high": None, "actions": None}
+OF_ENDS = {"on_end": "restart", "end_reward": 0.0, "failures": "default", "end_target": 1e-3}
+OF_EVERY_ENV = {"use_model": True, **OF_ENDS, "bins": None, "low": None, "high": None, "actions": None}
 
 
 def resolve(path: object, key: str) -> type:

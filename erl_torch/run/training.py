@@ -28,6 +28,7 @@ from erl_torch.learners.replicas import Replicas
 from erl_torch.learners.s1 import kernels
 from erl_torch.log.tensorboard import hyperparameters
 from erl_torch.mdp.from_gymnasium import sizes
+from erl_torch.mdp.tabular import check_policy
 from erl_torch.notes import collected
 from erl_torch.problem import Problem
 from erl_torch.rng import streams
@@ -89,8 +90,9 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
         if cfg[key] and not many:
             raise InputError(key, cfg[key], "left out, or used with n_replicas > 1 or vary.KEY=[...]")
     with collected() as notes, contextlib.closing(make_env(cfg.env)) as env:
-        world = make_world(cfg.env, env, safe_point)
         learner = make_learner(cfg.learner, *sizes(env))
+        prior = check_policy("learner.prior_policy", learner.prior_policy, *sizes(env))
+        world = make_world(cfg.env, env, safe_point, None if "beta" in cfg.vary else learner.beta, prior)
         problem = make_problem(cfg, env, world, learner)
         learner, experience, recorder, more = (_replicas if many else _single)(
             cfg, learner, problem, settings, safe_point
