@@ -39,6 +39,11 @@ _PUBLIC = {
     "run.session": "train",
     "solution": "Solution Status",
     "solvers": "certify iterate_biasing perron solve_biasing solve_soft_bellman",
+    "solvers.discounted": "solve_discounted",
+    "solvers.episodes": "EpisodeFigures evaluate_episodes",
+    "solvers.finite_horizon": "solve_finite_horizon",
+    "solvers.first_exit": "ExitSolution solve_first_exit",
+    "solvers.values": "ValueSolution",
 }
 _HOME = {name: module for module, names in _PUBLIC.items() for name in names.split()}
 

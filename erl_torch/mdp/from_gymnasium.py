@@ -35,12 +35,14 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 import scipy.sparse as sp
+import scipy.sparse.csgraph as csgraph
 from gymnasium import wrappers
 from numpy.typing import ArrayLike
 
 from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.labels import Labels, SpaceLabels
+from erl_torch.mdp.ends import Failures, Rule, with_end_reward
 from erl_torch.mdp.tabular import TabularMDP, normalise_rows
 from erl_torch.notes import note
 
@@ -142,11 +144,20 @@ def _own_start(env: gym.Env[Any, Any]) -> ArrayLike | None:
 # -- the model ----------------------------------------------------------------------------------------------
 
 
+class Ends(NamedTuple):
+    """How the steps of a model end episodes; all [S, A]."""
+
+    ended: np.ndarray  # the probability that the step ends the episode
+    failed: np.ndarray  # that it ends it in failure
+
+
 def tabular_mdp(
     env: gym.Env[Any, Any],
     on_end: str = "restart",
     start: ArrayLike | None = None,
     allowed: ArrayLike | None = None,
+    end_reward: float = 0.0,
+    failures: Rule = "default",
 ) -> TabularMDP:
     """The model of an environment that has one; see the module's docstring.
 
@@ -155,29 +166,35 @@ def tabular_mdp(
         on_end: "restart" or "absorb".
         start: [S], the start distribution; None is the environment's own.
         allowed: [S, A] bool, the actions that each state has; None is all that the model has.
+        end_reward: added to the reward of the steps that end an episode: a charge, < 0, of those that fail, or a bonus,
+            > 0, of the others.
+        failures: the rule that says which ends are failures (``erl_torch.mdp.ends``).
 
     Raises:
-        InputError: no model, a table that is not as above, or a model that leaves out part of the process.
+        InputError: no model, a table that is not as above, a model that leaves out part of the process, or an
+            end_reward that no end gets.
 
     Warns:
         MeanRewardWarning: rewards depend on s'.
     """
     checks.one_of("on_end", on_end, ("restart", "absorb"))
-    checks.instance("env", env, gym.Env, "an environment of Gymnasium's")
-    if (own := overridden(env)) is not None:
-        raise InputError("env", env, f"one whose model describes its steps: {own} ({INSIST})")
-    changed = changed_by(env)
-    if changed is not None:
-        raise InputError("env", env, f"without {changed}, under which the model is not known")
+    _check_known(env)
     mdp = known_mdp(env)
     if mdp is not None:
+        reward = mdp.reward
+        if end_reward:
+            ends = model_ends(env, failures)
+            reward = with_end_reward(reward, ends.ended, ends.failed, end_reward)
         mask = mdp.allowed if allowed is None else mdp.allowed & np.asarray(allowed, bool)
         first = mdp.start if start is None else start
-        mdp = TabularMDP(mdp.transition, mdp.reward, first, allowed=mask)  # type: ignore[arg-type]
-        ends = np.flatnonzero(ending_states(env, mdp.n_states))
-        return mdp if on_end == "restart" else _absorbed(mdp, ends, mdp.reward[ends])
+        mdp = TabularMDP(mdp.transition, reward, first, allowed=mask)  # type: ignore[arg-type]
+        last = np.flatnonzero(ending_states(env, mdp.n_states))
+        return mdp if on_end == "restart" else absorbed(mdp, last, mdp.reward[last])
     n_states, n_actions = sizes(env)
     row, to, p, r, end = _entries(_table(env), env.unwrapped)
+    if end_reward:
+        failed = _failures(failures, r, end, n_states).among(r, to) & end
+        r = with_end_reward(r, end, failed, end_reward)
     n_rows = n_states * n_actions
     first = _start(_own_start(env) if start is None else start, n_states)
     missing, silent = _missing(row, n_states, n_actions)
@@ -207,11 +224,59 @@ def tabular_mdp(
         return TabularMDP(transition, mean.reshape(n_states, n_actions), first, allowed=allowed)  # type: ignore[arg-type]
     transition = on + sp.coo_array((p[end], (row[end], to[end])), shape=shape) + from_start
     mdp = TabularMDP(transition, mean.reshape(n_states, n_actions), first, allowed=allowed)  # type: ignore[arg-type]
-    terminal = np.unique(to[end])
-    both = np.intersect1d(terminal, to[~end & ~np.isin(row // n_actions, terminal)])
+    # States that no episode comes to do not count: Taxi's table has rows for them too.
+    seen = _come_to(row[~end] // n_actions, to[~end], first)
+    terminal = np.setdiff1d(to[end], np.flatnonzero(seen))
+    both = np.intersect1d(to[end & seen[row // n_actions]], np.flatnonzero(seen))
     if both.size:
         raise InputError("on_end", on_end, f"restart: state {both[0]} is entered with and without an episode's end")
-    return _absorbed(mdp, terminal, np.where(absorbing(mdp)[terminal, None], mdp.reward[terminal], 0.0))
+    return absorbed(mdp, terminal, np.where(absorbing(mdp)[terminal, None], mdp.reward[terminal], 0.0))
+
+
+def model_ends(env: gym.Env[Any, Any], failures: Rule = "default") -> Ends:
+    """How the steps of an environment that has a model end episodes.
+
+    Raises:
+        InputError: no model, or a rule that cannot be used.
+    """
+    _check_known(env)
+    mdp = known_mdp(env)
+    if mdp is not None:
+        ends = ending_states(env, mdp.n_states)
+        over = np.repeat(ends[:, None], mdp.n_actions, 1)
+        rule = _failures(failures, mdp.reward, over, mdp.n_states)
+        state = np.repeat(np.arange(mdp.n_states)[:, None], mdp.n_actions, 1)
+        return Ends(over.astype(np.float64), (over & rule.among(mdp.reward, state)).astype(np.float64))
+    n_states, n_actions = sizes(env)
+    row, to, p, r, end = _entries(_table(env), env.unwrapped)
+    failed = _failures(failures, r, end, n_states).among(r, to) & end
+    chances = (np.bincount(row[x], p[x], n_states * n_actions).reshape(n_states, n_actions) for x in (end, failed))
+    return Ends(*chances)
+
+
+def best_end(env: gym.Env[Any, Any]) -> float | None:
+    """The largest reward of a step that ends an episode, where the environment tells; -infinite if none ends one."""
+    if changed_by(env) is None and overridden(env) is None:
+        mdp = known_mdp(env)
+        if mdp is not None:
+            return float(mdp.reward[ending_states(env, mdp.n_states)].max(initial=-np.inf))
+        if has_table(env):
+            _, _, _, r, end = _entries(_table(env), env.unwrapped)
+            return float(r[end].max(initial=-np.inf))
+    return None
+
+
+def _failures(rule: Rule, reward: np.ndarray, end: np.ndarray, n_states: int) -> Failures:
+    return Failures.of(rule, float(reward[end].max(initial=-np.inf)), n_states)
+
+
+def _check_known(env: gym.Env[Any, Any]) -> None:
+    checks.instance("env", env, gym.Env, "an environment of Gymnasium's")
+    if (own := overridden(env)) is not None:
+        raise InputError("env", env, f"one whose model describes its steps: {own} ({INSIST})")
+    changed = changed_by(env)
+    if changed is not None:
+        raise InputError("env", env, f"without {changed}, under which the model is not known")
 
 
 def absorbing(mdp: TabularMDP) -> np.ndarray:
@@ -375,7 +440,18 @@ def _start(start: ArrayLike | None, n_states: int) -> np.ndarray:
     return distribution
 
 
-def _absorbed(mdp: TabularMDP, states: np.ndarray, reward: np.ndarray) -> TabularMDP:
+def _come_to(origin: np.ndarray, to: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """[S] bool: states that moves from ``origin`` to ``to``, [n] each, lead to from the support of ``start`` [S]."""
+    n, sources = len(start), np.flatnonzero(start > 0)
+    # One search from one more state, with a move to every source.
+    rows, columns = np.append(origin, np.full(len(sources), n)), np.append(to, sources)
+    graph = sp.csr_array((np.ones(len(rows), np.int8), (rows, columns)), shape=(n + 1, n + 1))
+    seen = np.zeros(n + 1, bool)
+    seen[csgraph.breadth_first_order(graph, n, return_predecessors=False)] = True
+    return seen[:n]
+
+
+def absorbed(mdp: TabularMDP, states: np.ndarray, reward: np.ndarray | float) -> TabularMDP:
     """``mdp`` with ``states`` never left and the given rewards, [n] or [n, A], there."""
     among = np.zeros(mdp.n_states, bool)
     among[states] = True

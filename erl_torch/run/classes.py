@@ -23,10 +23,11 @@ NODES: dict[str, type[FloatNode | IntegerNode | BooleanNode | StringNode]] = {
     "bool": BooleanNode,
     "str": StringNode,
 }
+OF_ENDS = {"on_end": "restart", "end_reward": 0.0, "failures": "default", "end_target": 1e-3}
 OF_EVERY_ENV = {
     "use_model": True,
     "use_action_mask": False,
-    "on_end": "restart",
+    **OF_ENDS,
     "bins": None,
     "low": None,
     "high": None,

@@ -304,7 +304,7 @@ def run_comparison(cfg: DictConfig, directory: Path, safe_point: Callable[[], No
     if not kernels.compiled_before():
         print("compiling the loops, about ten seconds: on the first run only", file=sys.stderr)
     with collected(), contextlib.closing(make_env(cfg.env)) as env:
-        world = make_world(cfg.env, env, safe_point)
+        world = make_world(cfg.env, env, safe_point, cfg.beta)
     # The start of the stream may be another than that of the episodes; the optimum does not depend on it.
     mdp = world.source if isinstance(world.source, TabularMDP) else world.mdp
     if mdp is None:

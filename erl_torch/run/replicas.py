@@ -330,11 +330,20 @@ class Judges:
             else Judge(self.episode, self.problem.prior, self.problem.horizon)
         )
 
+    @functools.cached_property
+    def of_success(self) -> Judge | None:
+        """Of the episodes' model with a reward of 1 for a success; None where it is not known."""
+        if self.episode is None or self.problem.success is None:
+            return None
+        return Judge(replace(self.episode, reward=self.problem.success), self.problem.prior, self.problem.horizon)
+
     def rewards(self, policy: np.ndarray) -> dict[str, float]:
         """Reward per step of a policy [S, A], and return of an episode where its model is known."""
         figures = {"reward_per_step": self.of_model.reward_per_step(policy)}
         if self.episode is not None:
             figures["return"] = self.problem.horizon * self.of_episode.reward_per_step(policy)
+        if self.of_success is not None:
+            figures["success_rate"] = self.problem.horizon * self.of_success.reward_per_step(policy)
         return figures
 
     def __call__(self, policies: np.ndarray, milestone: bool) -> dict[str, np.ndarray]:
@@ -353,12 +362,17 @@ class Judges:
                 figures["return"] = self.problem.horizon * figures["reward_per_step"]
             else:
                 figures["return"] = self.problem.horizon * each(lambda r: self.of_episode.reward_per_step(policies[r]))
+            if (succeeds := self.of_success) is not None:
+                figures["success_rate"] = self.problem.horizon * each(lambda r: succeeds.reward_per_step(policies[r]))
         elif milestone:
+            p = self.problem
             played = [
-                evaluate(self.problem.env, policy, beta, rng, self.n_episodes, self.problem.horizon, self.problem.prior)
+                evaluate(p.env, policy, beta, rng, self.n_episodes, p.horizon, p.prior, ends=p.ends)
                 for policy, beta, rng in zip(policies, self.betas, self.rngs, strict=True)
             ]
             figures["return"] = np.array([one.mean_return for one in played])
+            if p.ends is not None:
+                figures["success_rate"] = np.array([one.success_rate for one in played])
             if self.model is None:
                 figures["reward_per_step"] = np.array([one.reward_per_step for one in played])
                 figures["objective"] = np.array([one.objective for one in played])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import platform
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -39,11 +39,12 @@ def evaluation_tags(measured: Evaluation, prefix: str = "eval") -> dict[str, flo
 
 def figures(measured: Evaluation) -> dict[str, float]:
     """By name, as in ``erl_torch.log.quantities``."""
-    return {
+    values = {
         "return": measured.mean_return,
         "reward_per_step": measured.reward_per_step,
         "objective": measured.objective,
     }
+    return values if np.isnan(measured.success_rate) else {**values, "success_rate": measured.success_rate}
 
 
 def optimal_tags(optimum: Solution | None, model: TabularMDP | None, problem: Problem) -> dict[str, float]:
@@ -62,6 +63,8 @@ def optimal_tags(optimum: Solution | None, model: TabularMDP | None, problem: Pr
             values["reward_per_step"] = reward_per_step(model, policy, problem.horizon)
             if (episode := episode_model(problem)) is not None:
                 values["return"] = mean_return(episode, problem.horizon, policy)
+                if problem.success is not None:
+                    values["success_rate"] = success_rate(episode, problem.success, problem.horizon, policy)
     return tagged("optimal", values)
 
 
@@ -77,6 +80,11 @@ def data_tags(estimate: Estimate | None) -> dict[str, float]:
 def mean_return(episode: TabularMDP, horizon: int, policy: np.ndarray) -> float:
     """Expected return of an episode of at most ``horizon`` steps, which ``episode`` is the model of."""
     return horizon * reward_per_step(episode, policy, horizon)
+
+
+def success_rate(episode: TabularMDP, success: np.ndarray, horizon: int, policy: np.ndarray) -> float:
+    """Probability that an episode of at most ``horizon`` steps ends in success; ``success`` [S, A]: of each step."""
+    return horizon * reward_per_step(replace(episode, reward=success), policy, horizon)
 
 
 def versions() -> dict[str, str]:

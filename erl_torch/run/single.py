@@ -36,6 +36,7 @@ from erl_torch.run.report import (
     last_rows,
     mean_return,
     optimal_tags,
+    success_rate,
     versions,
 )
 from erl_torch.solution import Solution, proven
@@ -116,10 +117,16 @@ class SingleRecorder:
         return noted
 
     def _measure(self, policy: Policy) -> Evaluation:
-        p, e, exact = self.problem, self.settings, None
+        p, e = self.problem, self.settings
+        exact = succeeds = None
         if p.episode is not None:
             exact = functools.partial(mean_return, p.episode, p.horizon)
-        return evaluate(p.env, policy, self.learner.beta, self.rng, e.n_episodes, p.horizon, p.prior, self.model, exact)
+            if p.success is not None:
+                succeeds = functools.partial(success_rate, p.episode, p.success, p.horizon)
+        steps = e.n_episodes, p.horizon
+        return evaluate(
+            p.env, policy, self.learner.beta, self.rng, *steps, p.prior, self.model, exact, succeeds, p.ends
+        )
 
     # -- records --------------------------------------------------------------------------------------
 

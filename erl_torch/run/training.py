@@ -28,6 +28,7 @@ from erl_torch.learners.replicas import Replicas
 from erl_torch.learners.s1 import kernels
 from erl_torch.log.tensorboard import hyperparameters
 from erl_torch.mdp.from_gymnasium import sizes
+from erl_torch.mdp.tabular import check_policy
 from erl_torch.notes import collected, note
 from erl_torch.problem import Problem
 from erl_torch.rng import streams
@@ -92,8 +93,11 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
         if cfg[key] and not many:
             raise InputError(key, cfg[key], "left out, or used with n_replicas > 1 or vary.KEY=[...]")
     with collected() as notes, contextlib.closing(make_env(cfg.env)) as env:
-        world = make_world(cfg.env, env, safe_point)
         learner = make_learner(cfg.learner, *sizes(env))
+        prior = learner.prior_policy
+        if prior is not None:
+            prior = check_policy("learner.prior_policy", prior, *sizes(env))
+        world = make_world(cfg.env, env, safe_point, None if "beta" in cfg.vary else learner.beta, prior)
         if world.allowed is not None:
             learner = with_prior(learner, world.allowed)
         problem = make_problem(cfg, env, world, learner)
