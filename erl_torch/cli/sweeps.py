@@ -22,12 +22,15 @@ from types import NoneType
 from typing import Any
 
 from hydra.core.config_store import ConfigStore
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
 from hydra.core.utils import JobReturn, JobStatus
+from hydra.errors import HydraException
 from hydra.plugins.launcher import Launcher
 from omegaconf import DictConfig, flag_override, read_write
 
 from erl_torch.checks import InputError, is_number
+from erl_torch.cli.paths import quoted
 from erl_torch.files import alone, read_json, write_json
 from erl_torch.output import lasting
 
@@ -40,6 +43,24 @@ FINISHED = ("ended", "failed")  # statuses of jobs that are not started again
 SLURM_ENDS = {"BOOT_FAIL", "CANCELLED", "COMPLETED", "DEADLINE", "FAILED", "NODE_FAIL", "OUT_OF_MEMORY", "PREEMPTED"}
 SLURM_ENDS |= {"TIMEOUT", "GONE"}
 ASK_SLURM = 5.0  # seconds between questions to Slurm
+
+
+def directory(arguments: Sequence[str]) -> list[str]:
+    """hydra.sweep.dir of a sweep over environments: it is named for none of them."""
+    given = any(a.startswith("hydra.sweep.dir=") for a in arguments)
+    return [] if given or "env" not in varying(arguments) else ["hydra.sweep.dir=runs/sweep-${now:%m%d-%H%M%S-%f}"]
+
+
+def varying(arguments: Sequence[str]) -> list[str]:
+    """The keys among ``arguments`` that take several values."""
+    read = OverridesParser.create()
+    found = []
+    for argument in arguments:
+        with contextlib.suppress(HydraException):  # Hydra says what is wrong
+            override = read.parse_override(argument)
+            if override.is_sweep_override():
+                found.append(override.key_or_group)
+    return found
 
 
 def presets() -> None:
@@ -205,11 +226,14 @@ def patient_launchers() -> Iterator[list[Path]]:
 
     def instantiate_launcher(self: Plugins, *, config: DictConfig, **more: Any) -> Launcher:  # Any: as Hydra has it
         directory = str(config.hydra.sweep.dir)
+        # Jobs are named by what varies: this is left out.
+        task = list(map(str, config.hydra.overrides.task))
+        same = sorted({a.lstrip("+~").partition("=")[0] for a in task} - set(varying(task)))
         # One directory for all jobs, even where its name depends on a key that is swept over.
-        quoted = directory.replace("\\", "\\\\").replace("'", "\\'")
         given = config.hydra.overrides.hydra
         with read_write(given), flag_override(given, "struct", False):
-            given.append(f"hydra.sweep.dir='{quoted}'")
+            given.append(f"hydra.sweep.dir={quoted(directory)}")
+            given.append(f"hydra.job.config.override_dirname.exclude_keys=[{','.join(map(quoted, same))}]")
         return _Patient(make(self, config=config, **more), Path(directory), sweeps)
 
     Plugins.instantiate_launcher = instantiate_launcher  # type: ignore[method-assign,assignment]

@@ -34,6 +34,7 @@ from tqdm import tqdm
 
 from erl_torch import checks, parallel, pictures
 from erl_torch.checks import InputError
+from erl_torch.compiled import announcement
 from erl_torch.experience.collect import collect
 from erl_torch.experience.sources import Simulate
 from erl_torch.files import read_npy, write_json, write_png
@@ -301,7 +302,7 @@ def run_comparison(cfg: DictConfig, directory: Path, safe_point: Callable[[], No
             raise InputError("learners", name, " or ".join(n for n in map(str, cfg.learner) if n != name))
     torch.set_num_threads(1)
     if not kernels.compiled_before():
-        print("compiling the loops, about ten seconds: on the first run only", file=sys.stderr)
+        print(announcement(), file=sys.stderr)
     with collected(), contextlib.closing(make_env(cfg.env)) as env:
         world = make_world(cfg.env, env, safe_point)
     # The start of the stream may be another than that of the episodes; the optimum does not depend on it.

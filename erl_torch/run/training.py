@@ -21,6 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from erl_torch import checks
 from erl_torch.checks import InputError
+from erl_torch.compiled import announcement
 from erl_torch.experience.experience import Experience
 from erl_torch.experience.simulation import digest, longest
 from erl_torch.learners.learner import TabularLearner
@@ -77,7 +78,7 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
     many = cfg.n_replicas > 1 or bool(cfg.vary)
     torch.set_num_threads(1 if many else cfg.threads or 1)
     if not kernels.compiled_before():
-        print("compiling the loops, about ten seconds: on the first run only", file=sys.stderr)
+        print(announcement(), file=sys.stderr)
     settings = evaluation_settings(cfg.evaluation)
     device = "cpu" if many else cfg.learner.get("device", "cpu")
     saved = Checkpoints(directory, plain(cfg), cfg.checkpoint_every, device)
