@@ -124,11 +124,6 @@ def test_bands_have_their_lower_end_below():
     }
 
 
-def test_jobs_of_a_sweep_are_shown_side_by_side():
-    assert where(Path("runs/windy_cliff/sweep-1/000-seed=0"))[1] == Path("runs/windy_cliff/sweep-1")
-    assert where(Path("runs/windy_cliff/1"))[1] == "runs"
-
-
 def test_charts_show_runs_of_before_too():
     """Their tags begin with s1/ and exact/."""
     patterns = [pattern for titles in board.charts().values() for chart in titles.values() for pattern in chart]

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from erl_torch.cli import named_classes
 from erl_torch.cli.config import config_dir
+from erl_torch.files import here
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,7 @@ class Typed:
         if self.command == "train" and any((directory / "checkpoints").glob("*.ckpt")):
             folder = config_dir(self.arguments)
             given = [] if folder is None else ["--config-dir", str(folder)]
-            _say([*self.program, f"resume={_here(directory)}", *named_classes.needed(directory), *given])
+            _say([*self.program, f"resume={here(directory)}", *named_classes.needed(directory), *given])
         elif self.command == "reproduce":
             _say([*self.program, *self.arguments])
 
@@ -52,13 +53,7 @@ class Typed:
         """Print the command that goes on with the sweep in the last of these directories, if there is one."""
         if sweeps:
             others = [a for a in self.arguments if not a.startswith("hydra.sweep.dir=")]
-            _say([*self.program, *others, f"hydra.sweep.dir={_here(sweeps[-1])}"])
-
-
-def _here(directory: Path) -> Path:
-    with contextlib.suppress(ValueError):
-        return directory.resolve().relative_to(Path.cwd())
-    return directory
+            _say([*self.program, *others, f"hydra.sweep.dir={here(sweeps[-1])}"])
 
 
 def _say(words: Sequence[str]) -> None:

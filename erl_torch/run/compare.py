@@ -37,7 +37,7 @@ from erl_torch.checks import InputError
 from erl_torch.compiled import announcement
 from erl_torch.experience.collect import collect
 from erl_torch.experience.sources import Simulate
-from erl_torch.files import read_npy, write_json, write_png
+from erl_torch.files import here, read_npy, write_json, write_png
 from erl_torch.learners.learner import StreamLearner
 from erl_torch.learners.s1 import kernels
 from erl_torch.mdp.tabular import TabularMDP, check_policy
@@ -343,9 +343,7 @@ def run_comparison(cfg: DictConfig, directory: Path, safe_point: Callable[[], No
     write_json(directory / "compare.json", result)
     title = f"{cfg.env.name}, beta {found.beta:g}: {len(found.seeds)} seeds"
     write_png(directory / "compare.png", pictures.learning_curves(result["sizes"], result["curves"], title))
-    with contextlib.suppress(ValueError):
-        directory = directory.resolve().relative_to(Path.cwd())
     print(f"\n{title}, {found.sizes[-1]:,} tuples each, theta* {found.theta:.7f}\n\n{found.table()}")
     print("\ngap: mean over seeds, interquartile mean and its interval (Student's t); other columns: means")
-    print(f"tuples: streamed, all passes together\nrun directory  {directory}")
+    print(f"tuples: streamed, all passes together\nrun directory  {here(directory)}")
     return result

@@ -47,6 +47,7 @@ from erl_torch.run.checkpoint import Checkpoints
 from erl_torch.run.groups import Group, groups_of
 from erl_torch.run.judge import EvaluationSettings
 from erl_torch.run.loop import Run, SafePoint
+from erl_torch.run.origin import shown
 from erl_torch.run.replicas import ReplicaRecorder
 from erl_torch.run.report import Title
 from erl_torch.run.settings import check_keys
@@ -103,7 +104,7 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
             digest=digest(experience),
             recorder=recorder,
             saved=saved,
-            hyperparameters=hyperparameters(plain(cfg), **more),
+            hyperparameters=hyperparameters(plain(cfg), shown(directory), **more),
             configuration=OmegaConf.to_yaml(cfg, resolve=True),
             every=settings.every,
             talks=True,
