@@ -225,11 +225,14 @@ def table(sweep: Path, rows: Sequence[dict[str, Any]]) -> str:
     """
     shared = [o for o in rows[0]["overrides"] if len(rows) > 1 and all(o in row["overrides"] for row in rows)]
     problems = {_problem(row["overrides"]) for row in rows}
-    columns = sorted(FIGURES, key="gap".__ne__) if len(problems) > 1 else FIGURES
+    columns = [name for name in FIGURES if any(row[name] is not None for row in rows)]
+    if len(problems) > 1:
+        columns.sort(key="gap".__ne__)
 
     def own(overrides: Sequence[str]) -> str:
-        # Sweepers draw numbers of 17 digits.
-        return " ".join(re.sub(LONG_NUMBER, lambda n: f"{float(n[0]):.4g}", o) for o in overrides if o not in shared)
+        # Sweepers draw numbers of 17 digits; Hydra escapes colons.
+        texts = (re.sub(LONG_NUMBER, lambda n: f"{float(n[0]):.4g}", o) for o in overrides if o not in shared)
+        return " ".join(texts).replace("\\:", ":")
 
     means = averages(rows)
     best = set() if means else _best([(_problem(row["overrides"]), row["objective"]) for row in rows])

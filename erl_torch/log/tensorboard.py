@@ -101,7 +101,7 @@ def layout(
             continue
         if f"{tag}_lower" in written:
             boards[quantity.board][f"{tag} in its proven bounds"] = [_band(tag)]
-        elif bands:
+        elif bands and not alone:
             boards[quantity.board][f"{tag} in its bands: proven, data's 95%"] = [(tag, tag, tag), *bands]
     return boards
 

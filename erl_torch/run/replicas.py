@@ -150,7 +150,7 @@ class ReplicaRecorder:
         rate = outcome.state.work / max(outcome.seconds, 1e-9)
         board.scalars({"time/tuples_per_second": rate}, step)
         board.scalars(self.recorded.final(), step)
-        board.texts({"verdict": verdict_of_replicas(self._away(solution))})
+        board.texts({"answer": verdict_of_replicas(self._away(solution))})
         for text in reservations.of_replicas(self._outcomes(solution)):
             note(text)
         return solution

@@ -220,7 +220,7 @@ class SingleRecorder:
         board.scalars({f"time/{self.learner.unit}_per_second": rate}, position)
         final = {"theta": solution.theta, "gap": solution.gap}
         said = verdict([row.get("theta", np.nan) for row in outcome.history], solution, self.estimate)
-        board.texts({"verdict": said})
+        board.texts({"answer": said})
         ends = {name: value for name, value in final.items() if value is not None}
         board.scalars(tagged("Final", figures(self.last) | ends), position)
         return solution

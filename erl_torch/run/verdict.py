@@ -10,6 +10,7 @@ from erl_torch.empirical.reservations import half_widths
 from erl_torch.empirical.uncertainty import Estimate
 from erl_torch.solution import Solution, Status, proven
 
+QUESTION = "Did theta converge?\n\n"
 LAST = 0.1  # of the epochs: over these theta must have settled
 SMALL_MOVE = 1e-3  # of |theta|, where no interval says what is small
 UNANSWERED = (Status.STOPPED, Status.NON_FINITE)
@@ -28,7 +29,7 @@ def verdict(thetas: Sequence[float], solution: Solution, estimate: Estimate | No
     """
     theta, bounds = solution.theta, solution.theta_bounds
     if theta is None or not np.isfinite(theta):
-        return f"**No.** The learner has no finite theta ({solution.status.name.lower()}).\n"
+        return f"{QUESTION}**No.** The learner has no finite theta ({solution.status.name.lower()}).\n"
     away = half_widths(theta, estimate)
     known = estimate is not None and np.isfinite(away)
     half = None
@@ -46,7 +47,8 @@ def verdict(thetas: Sequence[float], solution: Solution, estimate: Estimate | No
     else:
         rows.append(("still moving", f"{'no' if settled else 'yes'}: by {moved:.2g} over the last {n} of {len(thetas)}"))
     table = "".join(f"| {name} | {text} |\n" for name, text in rows)
-    return f"**{_answer(solution, settled, away if known else None)}**\n\ntheta = {theta:z.6g}\n\n| | |\n|---|---|\n{table}"
+    answer = _answer(solution, settled, away if known else None)
+    return f"{QUESTION}**{answer}**\n\ntheta = {theta:z.6g}\n\n| | |\n|---|---|\n{table}"
 
 
 def verdict_of_replicas(away: Sequence[float]) -> str:
@@ -57,10 +59,10 @@ def verdict_of_replicas(away: Sequence[float]) -> str:
     """
     known = [x for x in away if np.isfinite(x)]
     if not known:
-        return "**Not answered.** No stream has an interval to hold theta against (up to 24 replicas are looked at).\n"
+        return f"{QUESTION}**Not answered.** No stream has an interval to hold theta against (up to 24 replicas are looked at).\n"
     inside = sum(x <= 1 for x in known)
     return (
-        f"**Theta of {inside} of {len(known)} replicas is inside the 95% interval of its own stream.**\n\n"
+        f"{QUESTION}**Theta of {inside} of {len(known)} replicas is inside the 95% interval of its own stream.**\n\n"
         f"Median distance from its middle: {np.median(known):.3g} half widths; at most {max(known):.3g}. "
         f"{len(away) - len(known)} of {len(away)} replicas have no such interval.\n"
     )
