@@ -8,7 +8,7 @@ from collections.abc import Iterable
 
 
 def guess(word: object, allowed: Iterable[str]) -> str | None:
-    """The one of ``allowed`` that ``word`` resembles most, or None; capitals, ``_``, ``-`` and a version do not count."""
+    """The one of ``allowed`` that ``word`` resembles, or None; capitals, ``_``, ``-`` and a version do not count."""
     plain: dict[str, str] = {}
     for one in allowed:
         plain.setdefault(_plain(one), one)

@@ -13,15 +13,15 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
 from hydra.conf import HydraConf
-from hydra.core.config_store import ConfigStore
 from hydra.core import utils as hydra_utils
+from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, OverrideParseException
 from hydra.types import RunMode
@@ -214,28 +214,10 @@ def run(main: Callable[[], Any], about: str, conf: Path, config_name: str) -> No
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # for classes of one's own
     asked = Typed.of_process(config_name)
-    typed = [paths.given(a) if a.startswith("resume=") else a for a in asked.arguments]
-    resumed = [Path(a.removeprefix("resume=")) for a in typed if a.startswith("resume=")]
-    sweeping = options(typed).multirun
     try:
-        if config_name in WITH_CLASSES:
-            typed = [named_classes.dotted(a, conf) for a in typed]
-        others = [a for a in typed if not a.startswith("resume=")]
-        arguments = _resumed(typed)
-        if config_name in WITH_CLASSES:
-            arguments = named_classes.choices(arguments, conf)
-            for directory in resumed:
-                named_classes.named_again(directory, arguments, others)
-            arguments = named_classes.offer(arguments)
-            _offer_completions(typed, conf)
+        arguments, resumed, others = _understood(asked.arguments, conf, config_name)
     except InputError as error:
         raise SystemExit(report(error)) from None
-    arguments = [paths.readable(a, sweeping, arguments) for a in arguments]
-    # Keys that no schema lists need Hydra's "++"; the user need not know.
-    arguments = [f"++{a}" if a.startswith(OPEN_NODES) else a for a in arguments]
-    arguments = [b for a in arguments for b in _by_id(a, conf)]
-    if sweeping:
-        arguments += sweeps.directory(arguments)
     sys.argv[1:] = arguments
     full = bool(os.environ.get("HYDRA_FULL_ERROR"))
     # Hydra then raises what it would otherwise print over several lines.
@@ -246,11 +228,7 @@ def run(main: Callable[[], Any], about: str, conf: Path, config_name: str) -> No
         sweeps.presets()
         for directory in resumed:
             named_classes.composed_again(directory, arguments, others, conf, config_name)
-        for argument in arguments:
-            group, _, value = argument.partition("=")
-            if group in GROUPS and re.fullmatch(r"[-+.\d].*|true|false|null", value, re.IGNORECASE):
-                names = sorted(path.stem for path in (conf / group).glob("*.yaml"))
-                raise InputError(group, value, " or ".join(names))  # Hydra has a bare ValueError for it
+        _check_choices(arguments, conf)
         if {"-h", "--help"} & set(arguments):
             print(_help(about, conf, config_name, arguments))
             return
@@ -278,18 +256,52 @@ def run(main: Callable[[], Any], about: str, conf: Path, config_name: str) -> No
         raise SystemExit(1)
 
 
-def _offer_completions(arguments: list[str], conf: Path) -> None:
+def _understood(typed: Sequence[str], conf: Path, config_name: str) -> tuple[list[str], list[Path], list[str]]:
+    """The arguments that were ``typed`` as Hydra takes them, the directories to be resumed, and what is typed besides.
+
+    Classes of one's own are imported, and their arguments made keys. Raises InputError.
+    """
+    typed = [paths.given(a) if a.startswith("resume=") else a for a in typed]
+    resumed = [Path(a.removeprefix("resume=")) for a in typed if a.startswith("resume=")]
+    if config_name in WITH_CLASSES:
+        typed = [named_classes.dotted(a) for a in typed]
+    others = [a for a in typed if not a.startswith("resume=")]
+    arguments = _resumed(typed)
+    if config_name in WITH_CLASSES:
+        arguments = named_classes.choices(arguments, conf)
+        for directory in resumed:
+            named_classes.named_again(directory, arguments, others)
+        arguments = named_classes.offer(arguments)
+        _offer_completions(typed, conf)
+    sweeping = options(typed).multirun
+    arguments = [paths.readable(a, sweeping, arguments) for a in arguments]
+    # Keys that no schema lists need Hydra's "++"; the user need not know.
+    arguments = [f"++{a}" if a.startswith(OPEN_NODES) else a for a in arguments]
+    arguments = [b for a in arguments for b in _by_id(a, conf)]
+    return arguments + (sweeps.directory(arguments) if sweeping else []), resumed, others
+
+
+def _check_choices(arguments: Sequence[str], conf: Path) -> None:
+    """Raise InputError for a group's value that Hydra would not take for a name: it has a bare ValueError for it."""
+    for argument in arguments:
+        group, _, value = argument.partition("=")
+        if group in GROUPS and re.fullmatch(r"[-+.\d].*|true|false|null", value, re.IGNORECASE):
+            names = sorted(path.stem for path in (conf / group).glob("*.yaml"))
+            raise InputError(group, value, " or ".join(names))
+
+
+def _offer_completions(arguments: Sequence[str], conf: Path) -> None:
     """What Tab completes is in the environment: its classes are offered too."""
     *words, last = os.environ.get("COMP_LINE", "").split(" ")
     if {"-sc", "--shell-completion"} & set(arguments):
         os.environ["COMP_LINE"] = " ".join([*named_classes.offer(named_classes.choices(words, conf)), last])
 
 
-def _resumed(arguments: list[str]) -> list[str]:
+def _resumed(arguments: Sequence[str]) -> list[str]:
     """resume=RUN_DIR in full: the arguments that the run began with, and its directory."""
     given = [a for a in arguments if a.startswith("resume=")]
     if not given:
-        return arguments
+        return list(arguments)
     directory = Path(given[-1].removeprefix("resume="))
     began = began_with(directory, "resume")
     if began is None:
@@ -343,7 +355,7 @@ def report(error: Exception) -> int:
 
 def _line(error: Exception) -> str:
     if isinstance(error, OverrideParseException):
-        key, equals, value = error.override.partition("=")
+        key, _, value = error.override.partition("=")
         if not re.fullmatch(r"[+~]*[\w.@/:-]+", key) or not value:
             return f"{error.override}: not of the form key=value"
         whole = f"{key}={paths.quoted(value)}"
@@ -376,9 +388,9 @@ def _keys(node: Any, prefix: str) -> Iterator[str]:
     """The dotted keys of ``node``, groups among them."""
     for name in map(str, node):
         yield prefix + name
-        if not OmegaConf.is_missing(node, name) and not OmegaConf.is_interpolation(node, name):
-            if OmegaConf.is_dict(node[name]):
-                yield from _keys(node[name], f"{prefix}{name}.")
+        known = not OmegaConf.is_missing(node, name) and not OmegaConf.is_interpolation(node, name)
+        if known and OmegaConf.is_dict(node[name]):
+            yield from _keys(node[name], f"{prefix}{name}.")
 
 
 def _explain(error: Exception) -> str:
@@ -391,7 +403,11 @@ def _explain(error: Exception) -> str:
         if group.startswith("hydra/") and name in sweeps.EXTRAS:
             extra = sweeps.EXTRAS[name]
             return f"{group}={name}: not installed; pip install 'erl_torch[{extra}]' (in a clone: -e '.[{extra}]')"
-        own = f", or MODULE:{'ID or MODULE:' * (group == 'env')}CLASS of your own" if group in named_classes.GROUPS else ""
+        own = (
+            f", or MODULE:{'ID or MODULE:' * (group == 'env')}CLASS of your own"
+            if group in named_classes.GROUPS
+            else ""
+        )
         return str(InputError(group, name, " or ".join(options.split()) + own + did_you_mean(name, options.split())))
     missing = re.search(r"Missing mandatory value: (\S+)", said)
     if missing:

@@ -24,7 +24,7 @@ COLON = re.compile(r"([A-Za-z_]\w*(?:\.\w+)*):([A-Za-z_]\w*)")  # MODULE:CLASS, 
 CHOICE = re.compile(r"\+{0,2}(env|learner|experience)(@[\w.]+|(\.\w+)?\.class)?")
 
 
-def dotted(argument: str, conf: Path) -> str:
+def dotted(argument: str) -> str:
     """``argument`` with MODULE.CLASS for MODULE:CLASS where it chooses a group or a class.
 
     Raises InputError for a module that cannot be imported or has no such class, and for a ``class`` without a module.

@@ -1,4 +1,4 @@
-"""Values that are paths, as the shell hands them over: ``=``, ``#``, brackets, quotes, accents and ``~`` stand for themselves.
+"""Values that are paths, as the shell hands them over: with ``=``, ``#``, brackets, quotes, accents, and ``~``.
 
 Hydra's grammar knows most of these as signs of its own. So what it would not read as it stands is quoted for it.
 """

@@ -41,13 +41,15 @@ class Typed:
         return Typed(program, tuple(sys.argv[1:]), command)
 
     def say_how_to_go_on(self, directory: Path) -> None:
-        """Print the command that goes on with the run in ``directory``, if it left something to go on from."""
+        """Print the command that goes on with the run in ``directory``, or begins it again."""
         if self.command == "train" and any((directory / "checkpoints").glob("*.ckpt")):
             folder = config_dir(self.arguments)
             given = [] if folder is None else ["--config-dir", str(folder)]
             _say([*self.program, f"resume={here(directory)}", *named_classes.needed(directory), *given])
         elif self.command == "reproduce":
             _say([*self.program, *self.arguments])
+        else:
+            _say([*self.program, *self.arguments], "nothing is kept; to begin again")
 
     def say_how_to_go_on_sweeping(self, sweeps: Sequence[Path]) -> None:
         """Print the command that goes on with the sweep in the last of these directories, if there is one."""
@@ -56,6 +58,6 @@ class Typed:
             _say([*self.program, *others, f"hydra.sweep.dir={here(sweeps[-1])}"])
 
 
-def _say(words: Sequence[str]) -> None:
+def _say(words: Sequence[str], what: str = "to go on") -> None:
     with contextlib.suppress(OSError):
-        print(f"to go on: {shlex.join(words)}", file=sys.stderr)
+        print(f"{what}: {shlex.join(words)}", file=sys.stderr)

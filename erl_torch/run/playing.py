@@ -98,7 +98,9 @@ def _check_named(cfg: DictConfig, settings: DictConfig, run: Path) -> None:
     wanted = [f"env.class={kind}"] * (kind is not None and not is_own(kind) and named is None)
     wanted += [f"module={module}"] * bool(colon and cfg.module is None)
     if wanted:
-        raise InputError("run", run, f"played with what makes its environment, which is imported: add {shlex.join(wanted)}")
+        raise InputError(
+            "run", run, f"played with what makes its environment, which is imported: add {shlex.join(wanted)}"
+        )
     if cfg.module is not None and cfg.module != (module if colon else None):
         allowed = module if colon else f"left out: no module makes the environment of {run}"
         raise InputError("module", cfg.module, allowed)

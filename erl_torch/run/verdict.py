@@ -45,7 +45,9 @@ def verdict(thetas: Sequence[float], solution: Solution, estimate: Estimate | No
     if moved is None:
         rows.append(("still moving", "cannot be seen: theta is there once"))
     else:
-        rows.append(("still moving", f"{'no' if settled else 'yes'}: by {moved:.2g} over the last {n} of {len(thetas)}"))
+        rows.append(
+            ("still moving", f"{'no' if settled else 'yes'}: by {moved:.2g} over the last {n} of {len(thetas)}")
+        )
     table = "".join(f"| {name} | {text} |\n" for name, text in rows)
     answer = _answer(solution, settled, away if known else None)
     return f"{QUESTION}**{answer}**\n\ntheta = {theta:z.6g}\n\n| | |\n|---|---|\n{table}"
@@ -59,7 +61,7 @@ def verdict_of_replicas(away: Sequence[float]) -> str:
     """
     known = [x for x in away if np.isfinite(x)]
     if not known:
-        return f"{QUESTION}**Not answered.** No stream has an interval to hold theta against (up to 24 replicas are looked at).\n"
+        return f"{QUESTION}**Not answered.** No stream has an interval to hold theta against (24 replicas are looked at).\n"
     inside = sum(x <= 1 for x in known)
     return (
         f"{QUESTION}**Theta of {inside} of {len(known)} replicas is inside the 95% interval of its own stream.**\n\n"
@@ -69,12 +71,12 @@ def verdict_of_replicas(away: Sequence[float]) -> str:
 
 
 def _answer(solution: Solution, settled: bool, away: float | None) -> str:
-    theta, bounds = solution.theta, solution.theta_bounds
     if solution.status in UNANSWERED:
         return f"Not answered: the run ended before it was through ({solution.status.name.lower()})."
-    if theta is not None and bounds is not None and bounds[0] <= theta <= bounds[1]:
-        if bounds[1] - bounds[0] <= SMALL_MOVE * abs(theta):
-            return "Yes: theta is inside its proven bounds."
+    assert solution.theta is not None
+    low, high = solution.theta_bounds or (-np.inf, np.inf)
+    if low <= solution.theta <= high and high - low <= SMALL_MOVE * abs(solution.theta):
+        return "Yes: theta is inside its proven bounds."
     if not settled:
         return "Not yet: theta still moves."
     if away is None:
