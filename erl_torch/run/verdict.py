@@ -61,7 +61,7 @@ def verdict_of_replicas(away: Sequence[float]) -> str:
     """
     known = [x for x in away if np.isfinite(x)]
     if not known:
-        return f"{QUESTION}**Not answered.** No stream has an interval to hold theta against (24 replicas are looked at).\n"
+        return f"{QUESTION}**Not answered.** No stream has an interval that theta is held against.\n"
     inside = sum(x <= 1 for x in known)
     return (
         f"{QUESTION}**Theta of {inside} of {len(known)} replicas is inside the 95% interval of its own stream.**\n\n"
