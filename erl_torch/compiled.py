@@ -23,7 +23,8 @@ def find_room() -> None:
     given = os.environ.get("NUMBA_CACHE_DIR")
     own = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
     # As Numba looks for room, in its order.
-    if any(map(_can_be_written, [*([given] if given else []), PACKAGE / "__pycache__", os.path.join(own, "numba")])):
+    places = (given, str(PACKAGE / "__pycache__"), os.path.join(own, "numba"))
+    if any(_can_be_written(place) for place in places if place):
         return
     folder = str(_of_this_user())
     _found.append(folder)
@@ -38,7 +39,7 @@ def announcement() -> str:
     return f"compiling the loops, about ten seconds: on the first run only{elsewhere}"
 
 
-def _can_be_written(folder: str | os.PathLike[str]) -> bool:
+def _can_be_written(folder: str) -> bool:
     """Whether files can be written in ``folder``, or it can be made."""
     path = Path(folder).absolute()
     while not path.exists() and path != path.parent:

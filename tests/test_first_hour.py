@@ -4,7 +4,11 @@ import json
 import os
 import re
 import shlex
+import shutil
+import sys
+import tempfile
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -86,6 +90,8 @@ def mine(tmp_path, monkeypatch):
     (tmp_path / "mine.py").write_text(MINE)
     (tmp_path / "broken.py").write_text("import mine\nmine.absent\n")
     monkeypatch.syspath_prepend(tmp_path)
+    for name in ("mine", "broken"):
+        monkeypatch.delitem(sys.modules, name, raising=False)  # of another test
 
 
 @pytest.mark.slow
@@ -219,11 +225,10 @@ def test_jobs_may_work_in_their_directories(tmp_path, typed_here):
 
 
 def test_loops_are_kept_where_nobody_else_writes(tmp_path, monkeypatch):
-    monkeypatch.setattr(compiled.tempfile, "gettempdir", lambda: str(tmp_path))
-    monkeypatch.setattr(compiled.tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.setattr(compiled, "_found", [])
     monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
-    monkeypatch.setattr(compiled.sys, "modules", {})
+    monkeypatch.setattr("erl_torch.compiled.sys", SimpleNamespace(modules={}))  # as before Numba is imported
     monkeypatch.setattr(compiled, "_can_be_written", lambda folder: True)
     compiled.find_room()
     assert "NUMBA_CACHE_DIR" not in os.environ
@@ -312,7 +317,7 @@ def test_what_varies_is_told_from_what_does_not():
 
 @pytest.mark.slow
 def test_without_slurm_there_is_one_line(tmp_path, typed_here, monkeypatch):
-    monkeypatch.setattr(sweeps.shutil, "which", lambda name: None)
+    monkeypatch.setattr(shutil, "which", lambda name: None)
     code, out, err = typed_here("train.py", "-m", "hydra/launcher=submitit_slurm", "seed=0,1")
     assert (code, out, err.count("\n")) == (1, "", 1)
     assert "there is no srun here" in err

@@ -73,7 +73,7 @@ def test_played(typed_here):
     assert "x......." in out
     refused, _, err = typed_here(*(a for a in PLAY if not a.startswith("env")))
     assert refused == 1
-    assert "must be typed as env.class=my_package.Ring" in err
+    assert err.endswith("add env.class=my_package.Ring\n")
 
 
 def test_compared(tmp_path, typed_here):

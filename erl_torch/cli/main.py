@@ -41,7 +41,8 @@ from erl_torch.run.settings import allowed
 # Here, for jobs in processes of their own: loading the task imports this module, and names directories next.
 register()
 
-GROUPS = ("env", "learner", "experience", "evaluation")
+OF_CLASSES = ("env", "learner", "experience")
+GROUPS = (*OF_CLASSES, "evaluation")
 WITH_CLASSES = ("train", "compare")  # the commands that make what a class is named for
 BY_RUN = (InputError, ArithmeticError, OSError, MemoryError, BrokenExecutor)
 BY_CONFIGURATION = (HydraException, OmegaConfBaseException)
@@ -319,7 +320,8 @@ def _by_id(argument: str, conf: Path) -> list[str]:
     key, _, value = argument.partition("=")
     if key != "env" or not any(map(ENV_ID.fullmatch, value.split(","))):
         return [argument]
-    ids = {str(OmegaConf.load(path).get("id")): path.stem for path in sorted((conf / "env").glob("*.yaml"))}  # type: ignore[union-attr]
+    loaded = {path.stem: OmegaConf.load(path) for path in sorted((conf / "env").glob("*.yaml"))}
+    ids = {str(node.get("id")): name for name, node in loaded.items() if isinstance(node, DictConfig)}
     names = [ids.get(name, name) for name in value.split(",")]
     if len(names) == 1 and names == [value]:
         return ["env=gym", f"env.id={value}"]
@@ -403,11 +405,7 @@ def _explain(error: Exception) -> str:
         if group.startswith("hydra/") and name in sweeps.EXTRAS:
             extra = sweeps.EXTRAS[name]
             return f"{group}={name}: not installed; pip install 'erl_torch[{extra}]' (in a clone: -e '.[{extra}]')"
-        own = (
-            f", or MODULE:{'ID or MODULE:' * (group == 'env')}CLASS of your own"
-            if group in named_classes.GROUPS
-            else ""
-        )
+        own = f", or MODULE:{'ID or MODULE:' * (group == 'env')}CLASS of your own" if group in OF_CLASSES else ""
         return str(InputError(group, name, " or ".join(options.split()) + own + did_you_mean(name, options.split())))
     missing = re.search(r"Missing mandatory value: (\S+)", said)
     if missing:

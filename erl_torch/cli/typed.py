@@ -32,6 +32,7 @@ class Typed:
     def of_process(command: str) -> Typed:
         """The command of this process; Python has taken the interpreter's own name from it."""
         script = Path(sys.argv[0])
+        program: tuple[str, ...]
         if script.suffix != ".py":
             program = (script.name, command)
         elif script.name == "commands.py":

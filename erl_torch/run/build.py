@@ -75,10 +75,13 @@ def make_env(cfg: DictConfig, render_mode: str | None = None) -> gym.Env[Any, An
             arguments = settings_of(keys, kind, OF_NO_ENV)
         if isinstance(arguments.get("wind"), str):
             arguments["wind"] = read_npy(arguments["wind"], "wind")
-        if render_mode is not None:
-            arguments["render_mode"] = render_mode
+        shown = {} if render_mode is None else {"render_mode": render_mode}
         try:
-            env = gym.make(spec, **arguments)
+            if isinstance(spec, EnvSpec):  # its arguments may have the names of gymnasium.make's own
+                spec.kwargs = arguments
+                env = gym.make(spec, **shown)
+            else:
+                env = gym.make(spec, **arguments, **shown)
         except InputError:
             raise
         except (gym.error.Error, ImportError) as error:
