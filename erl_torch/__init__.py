@@ -7,7 +7,10 @@ import itself stays light. Their types are in ``__init__.pyi``.
 from __future__ import annotations
 
 import erl_torch.envs  # noqa: F401  (registers the environments)
+from erl_torch.compiled import find_room
 from erl_torch.lazy import Renamed, loader
+
+find_room()  # before any module with loops
 
 __version__ = "0.1.0"
 

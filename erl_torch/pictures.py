@@ -107,7 +107,9 @@ def bands(
     ``card``: draw it small enough for a card of TensorBoard's; use it with one panel.
     """
     exact: dict[str, Any] = {"linestyle": "", "marker": "x", "markersize": 5} if markers else {"linestyle": "--"}
-    caption = f"mean; shaded: quartiles; thin: extremes; {'crosses' if markers else 'dashed'}: exact"
+    known = any(y is not None for lines in panels.values() for line in lines for y in line.exact)
+    caption = "mean; shaded: quartiles; thin: extremes"
+    caption += f"; {'crosses' if markers else 'dashed'}: exact" if known else ""
     figure, all_axes = _panels(len(panels), title, caption, card)
     for axes, (label, lines) in zip(all_axes, panels.items(), strict=True):
         for i, line in enumerate(lines):

@@ -12,7 +12,8 @@ from helpers import ended
 ROOT = Path(__file__).parents[1] / "erl_torch"
 # From the ground up; a folder may import from those on lines above its own.
 FLOORS = (
-    {"lazy", "checks", "configurations", "labels", "notes", "output", "rng", "files", "parallel", "pictures", "log"},
+    {"compiled", "guesses", "lazy"},
+    {"checks", "configurations", "labels", "notes", "output", "rng", "files", "parallel", "pictures", "log"},
     {"solution", "mdp", "problem"},
     {"envs", "solvers"},
     {"experience"},

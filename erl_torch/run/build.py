@@ -44,7 +44,7 @@ from erl_torch.mdp.masks import ActionMasks
 from erl_torch.mdp.tabular import TabularMDP, check_policy
 from erl_torch.notes import note
 from erl_torch.problem import Problem
-from erl_torch.run.classes import OF_EVERY_ENV, parameters, resolve, settings_of
+from erl_torch.run.classes import KEYS_OF_ENV, OF_EVERY_ENV, imported, parameters, resolve, settings_of
 from erl_torch.solvers.charge import smallest_charge
 
 SafePoint = Callable[[], None]
@@ -52,7 +52,7 @@ TABLES = 8  # of a learner's size, about, while it learns and is evaluated
 REPLICA_BYTES = 10_000  # of a replica, besides: generators and settings
 LABELS = ("class", "name")  # keys of every group that are no arguments
 OF_THE_MODEL = ("stream", "n_samples", "model_seed")  # of a control task
-OF_NO_ENV = (*LABELS, "id", "suggest", *OF_THE_MODEL, *OF_EVERY_ENV)
+OF_NO_ENV = (*KEYS_OF_ENV, *OF_THE_MODEL, *OF_EVERY_ENV)
 
 
 class World(NamedTuple):
@@ -88,7 +88,10 @@ def make_env(cfg: DictConfig, render_mode: str | None = None) -> gym.Env[Any, An
     keys: Any = OmegaConf.to_container(cfg, resolve=True)
     with group("env"):
         kind, spec = _env_class(keys)
-        if "kwargs" in keys:
+        if kind is not None and keys.get("class") is not None:
+            named = {key: value for key, value in keys.items() if key not in KEYS_OF_ENV}
+            arguments = settings_of(named, kind, OF_NO_ENV) | (keys.get("kwargs") or {})
+        elif "kwargs" in keys:
             arguments = keys["kwargs"]
             checks.instance("kwargs", arguments, dict, "arguments by name, as in env.kwargs.is_slippery=false")
         elif kind is None:
@@ -99,10 +102,13 @@ def make_env(cfg: DictConfig, render_mode: str | None = None) -> gym.Env[Any, An
             arguments = settings_of(keys, kind, OF_NO_ENV)
         if isinstance(arguments.get("wind"), str):
             arguments["wind"] = read_npy(arguments["wind"], "wind")
-        if render_mode is not None:
-            arguments["render_mode"] = render_mode
+        shown = {} if render_mode is None else {"render_mode": render_mode}
         try:
-            env = gym.make(spec, **arguments)
+            if isinstance(spec, EnvSpec):  # its arguments may have the names of gymnasium.make's own
+                spec.kwargs = arguments
+                env = gym.make(spec, **shown)
+            else:
+                env = gym.make(spec, **arguments, **shown)
         except InputError:
             raise
         except (gym.error.Error, ImportError) as error:
@@ -125,6 +131,9 @@ def _env_class(keys: dict[str, Any]) -> tuple[type | None, str | EnvSpec]:
     if path is None and name is None:
         raise InputError("id", name, "given, as in env.id=FrozenLake-v1, or env.class=my_package.MyEnv")
     if path is None:
+        module, colon, _ = str(name).partition(":")
+        if colon:  # Gymnasium imports it too, and tells less where that fails
+            imported(module, "id", name, "an environment that Gymnasium has, as MODULE:ID")
         known = "kwargs" not in keys and name in ENTRY_POINTS
         creator: Any = load_env_creator(str(gym.spec(str(name)).entry_point)) if known else None
         return creator, str(name)

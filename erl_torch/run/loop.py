@@ -20,7 +20,7 @@ from erl_torch.checks import InputError
 from erl_torch.files import write_json
 from erl_torch.learners.learner import Learner, NonFiniteError, State, columns
 from erl_torch.log.event_file import PATTERN
-from erl_torch.log.tensorboard import Board, Boards
+from erl_torch.log.tensorboard import Board, Boards, of_sweep
 from erl_torch.notes import note
 from erl_torch.problem import Problem
 from erl_torch.run.checkpoint import Checkpoints, Content, Ended, check_state, rows_of
@@ -59,9 +59,8 @@ class Recorder(Protocol[S, A]):
     def shape(self) -> tuple[int, ...]:
         """Of a metric: () of one learner, [R] of replicas."""
 
-    @property
-    def boards(self) -> Boards:
-        """Charts of tab Custom Scalars."""
+    def boards(self, alone: bool) -> Boards:
+        """Charts of tab Custom Scalars, of a run that is ``alone`` or a job of a sweep."""
 
     def open(self, board: Board, goes_on: bool) -> None:
         """The record of the prior policy at step 0, unless the run ``goes_on`` from a checkpoint."""
@@ -156,7 +155,8 @@ class Run(Generic[S, E, A]):
             if not checkpoint:
                 recorder.begin()
             mark = checkpoint["events"] if checkpoint else None
-            with Board(saved.directory, self.hyperparameters, recorder.boards, mark) as board:
+            boards = recorder.boards(not of_sweep(saved.directory))
+            with Board(saved.directory, self.hyperparameters, boards, mark) as board:
                 if not checkpoint:
                     board.texts(texts(self.configuration, saved.directory))
                 recorder.open(board, checkpoint is not None)

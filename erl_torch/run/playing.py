@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shlex
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -95,15 +96,16 @@ def _check_named(cfg: DictConfig, settings: DictConfig, run: Path) -> None:
     named = cfg.env["class"]
     if named is not None and named != kind:
         raise InputError("env.class", named, f"left out: the environment of {run} is of another class")
-    if kind is not None and not is_own(kind) and named is None:
-        allowed = f"typed as env.class={kind}: it makes the run's environment, and is imported only if you name it"
-        raise InputError("env.class", named, allowed)
     module, colon, _ = str(settings.env.get("id")).partition(":")
-    if cfg.module != (module if colon else None):
-        if colon:
-            allowed = f"typed as module={module}: it makes the run's environment, and runs only if you name it"
-            raise InputError("module", cfg.module, allowed)
-        raise InputError("module", cfg.module, f"left out: no module makes the environment of {run}")
+    wanted = [f"env.class={kind}"] * (kind is not None and not is_own(kind) and named is None)
+    wanted += [f"module={module}"] * bool(colon and cfg.module is None)
+    if wanted:
+        raise InputError(
+            "run", run, f"played with what makes its environment, which is imported: add {shlex.join(wanted)}"
+        )
+    if cfg.module is not None and cfg.module != (module if colon else None):
+        allowed = module if colon else f"left out: no module makes the environment of {run}"
+        raise InputError("module", cfg.module, allowed)
 
 
 def episodes(

@@ -34,6 +34,7 @@ from erl_torch.run.groups import MOST_LOGGED, Group, Record, setting_text, stati
 from erl_torch.run.judge import SMALL, EvaluationSettings, episode_model, judging_model, of_data
 from erl_torch.run.loop import Outcome, Row, SafePoint
 from erl_torch.run.report import Title, ended_as, last_rows, plural, versions
+from erl_torch.run.verdict import verdict_of_replicas
 from erl_torch.solution import Status
 from erl_torch.solvers import solve_soft_bellman
 
@@ -117,8 +118,7 @@ class ReplicaRecorder:
     def shape(self) -> tuple[int, ...]:
         return (len(self.replicas),)
 
-    @property
-    def boards(self) -> Boards:
+    def boards(self, alone: bool) -> Boards:
         metrics = self.replicas.learners[0].start(self.problem).metrics()
         optima = dict(zip((group.name for group in self.groups[:MOST_LOGGED]), self.optima, strict=False))
         return replica_layout(optima, [*metrics, *self.first], self.table)
@@ -173,6 +173,7 @@ class ReplicaRecorder:
         rate = outcome.state.work / max(outcome.seconds, 1e-9)
         board.scalars({"time/tuples_per_second": rate}, step)
         board.scalars(self.recorded.final(), step)
+        board.texts({"answer": verdict_of_replicas(self._away(solution))})
         for text in reservations.of_replicas(self._outcomes(solution)):
             note(text)
         states, actions = self.problem.names
@@ -256,12 +257,12 @@ class ReplicaRecorder:
 
     def _half_widths(self, solution: ReplicaSolution) -> dict[str, float] | None:
         """Statistics of how far each theta is from what its own stream says; None where no stream has an interval."""
-        away = [
-            reservations.half_widths(one.theta, data.estimate)
-            for one, data in zip(solution.solutions, self.data, strict=True)
-        ]
-        finite = np.array([x for x in away if np.isfinite(x)])
+        finite = np.array([x for x in self._away(solution) if np.isfinite(x)])
         return statistics(finite) | {"replicas": len(finite)} if finite.size else None
+
+    def _away(self, solution: ReplicaSolution) -> list[float]:
+        pairs = zip(solution.solutions, self.data, strict=True)
+        return [reservations.half_widths(one.theta, data.estimate) for one, data in pairs]
 
     def summary(self, result: Mapping[str, Any], directory: Path) -> str:
         name = f"{self.title.env}, {self.title.learner}"

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import platform
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,6 +16,7 @@ import torch
 import erl_torch
 from erl_torch.empirical.uncertainty import Estimate
 from erl_torch.evaluation import Evaluation
+from erl_torch.files import here
 from erl_torch.log.quantities import tagged
 from erl_torch.mdp.tabular import TabularMDP
 from erl_torch.problem import Problem
@@ -98,15 +99,6 @@ def versions() -> dict[str, str]:
     }
 
 
-def where(directory: Path) -> tuple[Path, Path | str]:
-    """A run directory as a user would write it, and what to give TensorBoard."""
-    with contextlib.suppress(ValueError):
-        directory = directory.resolve().relative_to(Path.cwd())
-    if directory.parent.name.startswith("sweep-"):
-        return directory, directory.parent  # its runs side by side, by short names
-    return directory, "runs" if directory.parts[0] == "runs" else directory
-
-
 def headline(heading: str, result: Mapping[str, Any]) -> list[str]:
     """The first lines of a summary."""
     return ["", f"{heading}: {ended_as(result)}"]
@@ -114,13 +106,13 @@ def headline(heading: str, result: Mapping[str, Any]) -> list[str]:
 
 def last_rows(result: Mapping[str, Any], directory: Path) -> list[str]:
     """The last rows of a summary."""
-    directory, logs = where(directory)
+    where = here(directory)
     seconds, learning = result["seconds"], result["seconds_learning"]
     remedy = "" if seconds < 30 or learning > seconds / 5 else "; evaluation.every=10 measures policies less often"
     return [
         f"{'seconds':18}{seconds:.1f}, of which {learning:.1f} learning{remedy}",
-        f"{'run directory':18}{directory}",
-        f"{'look at it':18}tensorboard --logdir {logs}",
+        f"{'run directory':18}{where}",
+        f"{'look at it':18}tensorboard --logdir {shlex.quote(str(where))}",
         *(f"{'note':18}{text}" for text in result["notes"]),
     ]
 

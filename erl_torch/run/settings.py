@@ -13,6 +13,7 @@ from typing import Any
 from omegaconf import MISSING, DictConfig, OmegaConf
 
 from erl_torch.checks import InputError
+from erl_torch.guesses import did_you_mean
 
 
 @dataclass
@@ -137,7 +138,8 @@ def _check_node(node: DictConfig, schema: Any, prefix: str) -> None:  # a datacl
     names = [field.name for field in fields(schema)] if is_dataclass(schema) else list(map(str, node))
     for name in map(str, node):
         if name not in names:
-            raise InputError(prefix + name, node[name], f"left out: no such key; there are {', '.join(names)}")
+            hint = did_you_mean(name, names, prefix + "{}")
+            raise InputError(prefix + name, node[name], f"left out: no such key; there are {', '.join(names)}{hint}")
         if OmegaConf.is_missing(node, name):
             raise InputError(prefix + name, "???", f"given, as in {prefix}{name}=VALUE")
         if not OmegaConf.is_interpolation(node, name) and OmegaConf.is_dict(node[name]):

@@ -39,6 +39,7 @@ from erl_torch.run.report import (
     success_rate,
     versions,
 )
+from erl_torch.run.verdict import verdict
 from erl_torch.solution import Solution, proven
 from erl_torch.solvers import certify, solve_soft_bellman
 
@@ -145,10 +146,9 @@ class SingleRecorder:
     def shape(self) -> tuple[int, ...]:
         return ()
 
-    @property
-    def boards(self) -> Boards:
+    def boards(self, alone: bool) -> Boards:
         table = with_own(self.learner.quantities)
-        return layout([*self._names(self.start), *evaluation_tags(self.first)], self._constant, table)
+        return layout([*self._names(self.start), *evaluation_tags(self.first)], self._constant, table, alone)
 
     def open(self, board: Board, goes_on: bool) -> None:
         board.lines(self._constant)
@@ -240,6 +240,8 @@ class SingleRecorder:
         rate = position / max(outcome.seconds, 1e-9)
         board.scalars({f"time/{self.learner.unit}_per_second": rate}, position)
         final = {"theta": solution.theta, "gap": solution.gap}
+        said = verdict([row.get("theta", np.nan) for row in outcome.history], solution, self.estimate)
+        board.texts({"answer": said})
         ends = {name: value for name, value in final.items() if value is not None}
         board.scalars(tagged("Final", figures(self.last) | ends), position)
         names = self.problem.names
@@ -293,8 +295,8 @@ class SingleRecorder:
         rows = [
             (
                 q.row,
-                f"{before[q.name]:12{q.digits}}" if q.name in before else f"{'-':>12}",
-                f"{result[q.result]:12{q.digits}}" + of_play * (q.name == "theta"),
+                f"{before[q.name]:z12{q.digits}}" if q.name in before else f"{'-':>12}",
+                f"{result[q.result]:z12{q.digits}}" + of_play * (q.name == "theta"),
             )
             for q in QUANTITIES
             if q.digits and q.name in logged and result[q.result] is not None

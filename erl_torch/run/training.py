@@ -21,6 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from erl_torch import checks
 from erl_torch.checks import InputError
+from erl_torch.compiled import announcement
 from erl_torch.experience.experience import Experience, permitted
 from erl_torch.experience.simulation import digest, longest
 from erl_torch.learners.learner import TabularLearner, as_told, with_prior
@@ -47,6 +48,7 @@ from erl_torch.run.checkpoint import Checkpoints, failure_of
 from erl_torch.run.groups import Group, groups_of
 from erl_torch.run.judge import EvaluationSettings
 from erl_torch.run.loop import Run, SafePoint
+from erl_torch.run.origin import shown
 from erl_torch.run.replicas import ReplicaRecorder
 from erl_torch.run.report import Title
 from erl_torch.run.settings import check_keys
@@ -79,7 +81,7 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
     many = cfg.n_replicas > 1 or bool(cfg.vary)
     torch.set_num_threads(1 if many else cfg.threads or 1)
     if not kernels.compiled_before():
-        print("compiling the loops, about ten seconds: on the first run only", file=sys.stderr)
+        print(announcement(), file=sys.stderr)
     settings = evaluation_settings(cfg.evaluation)
     device = "cpu" if many else cfg.learner.get("device", "cpu")
     saved = Checkpoints(directory, plain(cfg), cfg.checkpoint_every, device)
@@ -111,7 +113,7 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
             digest=digest(experience),
             recorder=recorder,
             saved=saved,
-            hyperparameters=hyperparameters(plain(cfg), **more),
+            hyperparameters=hyperparameters(plain(cfg), shown(directory), **more),
             configuration=OmegaConf.to_yaml(cfg, resolve=True),
             every=settings.every,
             talks=True,
