@@ -7,6 +7,7 @@ one that there is, among which the share of the prior is divided.
 
 import warnings
 from dataclasses import fields, replace
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -455,7 +456,7 @@ def test_the_environment_of_a_model_tells_its_masks_and_refuses_others():
 # -- learners -------------------------------------------------------------------------------------------------
 
 
-LEARNERS = {
+LEARNERS: dict[str, Any] = {
     "s1": AlgorithmS1(beta=2.0, lr_u=0.05, n_epochs=2, n_bias=3),
     "s1, unvisited prior": AlgorithmS1(beta=2.0, lr_u=0.05, n_epochs=2, n_bias=3, unvisited="prior"),
     "s1, literal": AlgorithmS1(beta=2.0, lr_u=0.05, n_epochs=2, n_bias=2, implementation="literal"),
