@@ -13,7 +13,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from helpers import random_policy
+from helpers import composed, random_policy
 from oracle import counted, soft_rate
 
 import erl_torch
@@ -50,6 +50,7 @@ from erl_torch.learners.action_value.q_learning import (
 )
 from erl_torch.learners.action_value.z_learning import ZLearning
 from erl_torch.learners.exact import Exact
+from erl_torch.run.training import train
 from erl_torch.solvers.policy import objective
 
 SOLVERS = (solve_soft_bellman, solve_biasing)
@@ -400,6 +401,31 @@ def test_environments_that_mask_are_stepped_with_the_actions_that_are_left(seed)
     np.testing.assert_allclose(counts / counts.sum(1, keepdims=True), due, atol=6 / np.sqrt(counts.sum(1).min()))
 
 
+class Dressed(gym.Wrapper):
+    """The same, with the mask in the observation."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        masks = gym.spaces.MultiBinary(int(env.action_space.n))
+        self.observation_space = gym.spaces.Dict({"observation": env.observation_space, "action_mask": masks})
+
+    def reset(self, **options):
+        s, info = self.env.reset(**options)
+        return {"observation": s, **info}, {}
+
+    def step(self, action):
+        s, r, terminated, truncated, info = self.env.step(action)
+        return {"observation": s, **info}, r, terminated, truncated, {}
+
+
+def test_masks_in_observations_are_those_in_info():
+    mdp, _ = problem_of(5)
+    masks = ActionMasks(mdp.n_states, mdp.n_actions)
+    plain, dressed = collect(Told(mdp), 40, 50, 3), collect(Dressed(Told(mdp)), 40, 50, 3, masks=masks)
+    assert all(np.array_equal(getattr(plain, f.name), getattr(dressed, f.name)) for f in fields(plain))
+    assert np.array_equal(masks.allowed, mdp.allowed)
+
+
 @pytest.mark.parametrize("mode", list(gym.vector.AutoresetMode))
 def test_vectors_of_environments_are_stepped_with_the_actions_that_are_left(mode):
     mdp, _ = problem_of(5)
@@ -425,7 +451,7 @@ def test_masks_that_cannot_be_used_are_named():
         collect(Told(mdp), 50, 50, prior_policy=other)
     env = Told(mdp)
     env._info = lambda s: {"action_mask": [1, 1, 1]}
-    with pytest.raises(InputError, match=r"^info\['action_mask'\]=\[1, 1, 1\]: must be of shape \[2\]"):
+    with pytest.raises(InputError, match=r"info\['action_mask'\]=\[1, 1, 1\]: must be of shape \[2\]"):
         collect(env, 1, 1)
 
 
@@ -719,6 +745,55 @@ def test_a_log_with_actions_that_are_not_to_be_taken_is_noted(tmp_path):
     low, high, _ = optimum(listed(p, r, prior), 2.0)
     assert solution.theta_bounds[0] <= -low
     assert solution.theta_bounds[1] >= -high
+
+
+def test_the_command_line_reads_a_model_with_missing_actions(tmp_path):
+    mdp = harvest()
+    mdp.save(tmp_path / "harvest.npz")
+    np.save(tmp_path / "off.npy", np.full((10, 10), 0.1))
+    keys = ["env=mdp", f"env.path={tmp_path}/harvest.npz", "learner.beta=1.0", "evaluation.pictures=false"]
+    result = train(composed(*keys, "learner=exact"), tmp_path / "exact")
+    assert result["theta"] == pytest.approx(-1.1717884570, abs=1e-9)
+    few = ["learner=s1_efficient", "experience.n_episodes=20"]
+    result = train(composed(*keys, *few), tmp_path / "learnt")
+    assert result["status"] == "converged"
+    assert not erl_torch.Solution.load(tmp_path / "learnt" / "solution.npz").policy[missing_in(mdp)].any()
+    result = train(composed(*keys, *few, "n_replicas=2", "learner=s1"), tmp_path / "many")
+    assert not erl_torch.ReplicaSolution.load(tmp_path / "many" / "replicas.npz").policy[:, missing_in(mdp)].any()
+    with pytest.raises(InputError, match=r"behaviour_policy\[0, 1\]=0.1: must be 0: state 0 does not have action 1"):
+        train(composed(*keys, *few, f"experience.behaviour_policy={tmp_path}/off.npy"), tmp_path / "refused")
+    with pytest.raises(InputError, match=r"^env.use_action_mask=True: must be false: the environment has no method"):
+        train(composed("env=cliff_walking", "env.use_action_mask=true"), tmp_path / "refused")
+
+
+def test_taxi_has_fewer_actions_on_request(tmp_path):
+    """The optimum is that of an iteration over each state's list, a sweep at a time."""
+    from erl_torch import tabular_mdp
+
+    env: Any = gym.make("Taxi-v4").unwrapped
+    allowed = np.array([env.action_mask(s) for s in range(500)], bool)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        mdp = tabular_mdp(env, allowed=allowed)
+    assert np.array_equal(mdp.allowed, allowed)
+    p, r, value = mdp.transition, np.where(allowed, mdp.reward, -np.inf), np.zeros(500)
+    follows = np.asarray((p > 0).todense()).reshape(500, 6, 500).any(1)
+    reached = mdp.start > 0
+    for _ in range(100):
+        reached = reached | follows[reached].any(0)
+    for _ in range(20_000):
+        q = r + (p @ value).reshape(500, 6)
+        top = q.max(1)
+        gain = top + np.log(np.exp(q - top[:, None]).sum(1) / allowed.sum(1)) - value
+        if np.ptp(gain[reached]) < 1e-9:
+            break
+        value = value + 0.5 * (gain - gain[np.argmax(mdp.start)])
+    keys = ["env=taxi", "learner=exact", "learner.beta=1.0", "evaluation.pictures=false"]
+    result = train(composed(*keys, "env.use_action_mask=true"), tmp_path / "masked")
+    assert result["theta"] == pytest.approx(-gain[reached].mean(), abs=1e-8)
+    assert not erl_torch.Solution.load(tmp_path / "masked" / "solution.npz").policy[torch.tensor(~allowed)].any()
+    with pytest.raises(InputError, match=r"^env.use_action_mask=True: must be false: there is no model \(P\) to read"):
+        train(composed(*keys, "env.use_action_mask=true", "env.use_model=false"), tmp_path / "refused")
 
 
 def test_a_problem_hands_its_mask_on():
