@@ -333,6 +333,9 @@ class Told(gym.Env):
         self._inside, self._changing, self.taken = TabularEnv(mdp), changing, []
         self.observation_space, self.action_space = self._inside.observation_space, self._inside.action_space
 
+    def itself(self):
+        return self
+
     def _info(self, s):
         mask = self._inside.mdp.allowed[s].astype(np.int8)
         if self._changing is not None and s == 0 and len(self.taken) > self._changing:
@@ -430,7 +433,7 @@ def test_masks_in_observations_are_those_in_info():
 def test_vectors_of_environments_are_stepped_with_the_actions_that_are_left(mode):
     mdp, _ = problem_of(5)
     envs = [Told(mdp) for _ in range(3)]
-    vector = gym.vector.SyncVectorEnv([lambda env=env: env for env in envs], autoreset_mode=mode)
+    vector = gym.vector.SyncVectorEnv([envs[0].itself, envs[1].itself, envs[2].itself], autoreset_mode=mode)
     masks = ActionMasks(mdp.n_states, mdp.n_actions)
     data = collect(vector, 10, 60, 1, masks=masks)
     assert len(data) == 600
@@ -777,8 +780,8 @@ def test_taxi_has_fewer_actions_on_request(tmp_path):
         mdp = tabular_mdp(env, allowed=allowed)
     assert np.array_equal(mdp.allowed, allowed)
     p, r, value = mdp.transition, np.where(allowed, mdp.reward, -np.inf), np.zeros(500)
-    follows = np.asarray((p > 0).todense()).reshape(500, 6, 500).any(1)
-    reached = mdp.start > 0
+    follows = (p.toarray() > 0).reshape(500, 6, 500).any(1)
+    reached = np.asarray(mdp.start > 0)
     for _ in range(100):
         reached = reached | follows[reached].any(0)
     for _ in range(20_000):
@@ -806,6 +809,10 @@ def test_a_problem_hands_its_mask_on():
     data = collect(mdp, 10, 100, 0)
     *_, state = learner.run(problem, data)
     assert not state.policy[missing_in(mdp)].any()
+    exact = Exact(2.0)
+    *_, state = exact.run(Problem(env, mdp, uniform, TabularMDP(np.full((4, 3, 4), 0.25), mdp.reward)))
+    assert not state.policy[missing_in(mdp)].any()
+    assert not exact.solution(state).policy[missing_in(mdp)].any()
     *_, states = Replicas.of(AlgorithmS1(2.0, n_bias=1, n_epochs=1), 2).run(problem, data)
     assert not states.policy[:, missing_in(mdp)].any()
 
