@@ -197,8 +197,8 @@ MUTANTS = [
     Mutant(
         "a lane at 0 counts as healthy",
         "learners/s1/kernels.py",
-        "healthy = healthy and np.isfinite(x) and x > 0.0",
-        "healthy = healthy and np.isfinite(x)",
+        "healthy = healthy and ((np.isfinite(z[k]) and z[k] > 0.0) or g[k] < 0.0)",
+        "healthy = healthy and np.isfinite(z[k])",
         "test_replicas.py::test_a_replica_that_was_at_0_has_failed",
     ),
     Mutant(
@@ -458,8 +458,8 @@ MUTANTS = [
     Mutant(
         "pairs without visits get the mean without its mass",
         "learners/s1/algorithm.py",
-        "(weight * u).sum(-1, keepdims=True) / mass, 1.0)",
-        "(weight * u).sum(-1, keepdims=True), 1.0)",
+        "(weight * u).sum(-1, keepdims=True) / mass, u)",
+        "(weight * u).sum(-1, keepdims=True), u)",
         "test_algorithm_s1.py::test_visited_states_only",
     ),
     Mutant(
@@ -558,8 +558,8 @@ MUTANTS = [
     Mutant(
         "an action never tried is worth nothing",
         "learners/action_value/q_learning.py",
-        "return torch.where(seen, self.q, value[:, None])",
-        "return torch.where(seen, self.q, 0.0)",
+        "torch.where(seen, self.q, value[:, None])",
+        "torch.where(seen, self.q, 0.0)",
         "test_action_value.py::test_actions_never_taken_keep_their_prior_share",
     ),
     Mutant(
@@ -658,7 +658,7 @@ MUTANTS = [
     Mutant(
         "the class of most states, not of most tuples",
         "empirical/counts.py",
-        "tuples = np.bincount(label, self.visits.sum(1)) * closed",
+        "tuples = np.bincount(label, visits.sum(1)) * closed",
         "tuples = np.bincount(label) * closed",
         "test_certainty_equivalence.py::test_of_two_closed_sets_the_one_with_more_tuples_counts",
     ),
@@ -1325,15 +1325,15 @@ MUTANTS = [
     Mutant(
         "a truncated episode leads to the start",
         "experience/play.py",
-        "s_next = s if step.terminated else step.s_next",
-        "s_next = s if step.last else step.s_next",
+        "s_next, mask = now if step.terminated else reached",
+        "s_next, mask = now if step.last else reached",
         "test_experience.py::test_truncation_keeps_the_state_reached",
     ),
     Mutant(
         "a' of a stepped environment comes from the behaviour policy",
         "experience/play.py",
-        "a_next = act_next(s_next)",
-        "a_next = act(s_next)",
+        "a_next = act_next(s_next, mask)",
+        "a_next = act(s_next, mask)",
         "test_experience.py::test_law_of_the_stream",
     ),
     Mutant(
@@ -1346,8 +1346,8 @@ MUTANTS = [
     Mutant(
         "an episode that is cut off begins where it was",
         "experience/play.py",
-        "s = reset(env, plan.rng.environment) if step.last else step.s_next",
-        "s = reset(env, plan.rng.environment) if step.terminated else step.s_next",
+        "now = reset(env, plan.rng.environment) if step.last else reached",
+        "now = reset(env, plan.rng.environment) if step.terminated else reached",
         "test_experience.py::test_truncation_keeps_the_state_reached",
     ),
     Mutant(
@@ -1792,8 +1792,8 @@ MUTANTS = [
     Mutant(
         "states led to may be missing",
         "empirical/reservations.py",
-        "return bool(tried[members].all() and members[p.indices[entry]].all())",
-        "return bool(tried[members].all())",
+        "return bool((tried | ~mdp.allowed)[members].all() and members[p.indices[entry]].all())",
+        "return bool((tried | ~mdp.allowed)[members].all())",
         "test_reservations.py::test_data_without_a_state_that_theirs_lead_to_are_not_of_the_models_theta",
     ),
     Mutant(

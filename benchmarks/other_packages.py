@@ -7,7 +7,8 @@ The values were found by two routes each that share no code with this package (p
 relative soft value iteration); they have ten digits. A package that is not installed is left out, and said.
 
 Columns: difference between theta of ``solve_soft_bellman`` and the independent value, at beta 1 and 10; theta at
-beta 1 as ``EfficientS1`` learns it from 200,000 tuples of the prior, or 2,000 a pair if that is more, with the data's own 95% interval.
+beta 1 as ``EfficientS1`` learns it from 200,000 tuples of the prior, or 2,000 a pair if that is more, with the
+interval (95%) of the data.
 """
 
 from __future__ import annotations

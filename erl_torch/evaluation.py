@@ -56,7 +56,7 @@ def evaluate(
     Args:
         source: where the episodes are played; they end after ``horizon`` steps, or where the environment ends them.
         policy: [S, A]; 0 where the model's state does not have the action. In an environment that masks actions, those
-            that are left are played, with their shares.
+            that are left are played, with their shares; but as it is where there is a model that has all actions.
         beta: inverse temperature, 1/reward.
         rng: draws the episodes.
         n_episodes: whole number >= 1, episodes behind ``mean_return``.
@@ -96,7 +96,8 @@ def evaluate(
         played = float(returns.mean())
     else:
         assert not isinstance(source, TabularMDP)
-        sampled = _evaluate_by_playing(source, table, prior, beta, rng, n_episodes, horizon, ends)
+        masked = model is None or not model.allowed.all()
+        sampled = _evaluate_by_playing(source, table, prior, beta, rng, n_episodes, horizon, ends, masked)
         played, succeeded = sampled.mean_return, sampled.success_rate
     if model is None:
         return sampled
@@ -168,6 +169,7 @@ def _evaluate_by_playing(
     n_episodes: int,
     horizon: int,
     ends: EndRule | None,
+    masked: bool,
 ) -> Evaluation:
     kl = kl_per_state(policy, prior)
     batch = batched(env)
@@ -175,7 +177,7 @@ def _evaluate_by_playing(
         uniform = np.full(policy.shape, 1 / policy.shape[1])  # a' is drawn, and not looked at
         data = batch(Plan(n_episodes, horizon, Streams(rng, rng, rng), policy, uniform, False), "original")
         return Evaluation(data.r.sum() / n_episodes, data.r.mean(), float((data.r - kl[data.s] / beta).mean()))
-    choose = Draws(policy, rng)
+    choose = Draws(policy, rng, masked=masked)
     total = total_kl = charged = 0.0
     n_steps = n_successes = 0
     for _ in range(n_episodes):

@@ -325,7 +325,7 @@ def test_overflow_ends_with_a_status(learner_class):
         (RVISoftQ, {"reference": 9}, "reference=9: must be a state below 2"),
         (SoftQ, {"discount": 1.0}, r"discount=1.0: must be a number in \[0, 1\)"),
         (Sarsa, {"discount": -0.1}, "discount=-0.1"),
-        (QLearning, {"prior_policy": [[1.0, 0.0], [0.5, 0.5]]}, r"prior_policy\[0, 1\]=0.0"),
+        (QLearning, {"prior_policy": [[1.0, 1e-310], [0.5, 0.5]]}, r"prior_policy\[0, 1\]=1e-310"),
     ],
 )
 def test_bad_arguments(learner_class, options, message):

@@ -421,7 +421,7 @@ def test_pairs_never_visited_have_probability_zero_and_unseen_states_the_prior()
         {"log_domain": "yes"},
         {"unvisited": "prior"},
         {"tol": -1.0},
-        {"prior_policy": np.array([[1.0, 0.0]])},
+        {"prior_policy": np.array([[1.0, 1e-310]])},
     ],
 )
 def test_bad_settings_name_the_key(bad):

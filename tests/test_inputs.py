@@ -334,12 +334,11 @@ def test_parts_of_another_kind_are_named():
         Replicas(3)
 
 
-def test_a_model_of_other_sizes_and_a_prior_of_zero_are_named():
+def test_a_model_of_other_sizes_is_named_and_a_policy_off_the_prior_is_worth_nothing():
     other = TabularMDP(np.full((3, 2, 3), 1 / 3), np.zeros((3, 2)))
     with pytest.raises(InputError, match=r"^mdp=MDP of shape \(3, 2\): must be of shape \[2, 2\]"):
         evaluate(MDP, POLICY, 1.0, GENERATOR, mdp=other)
-    with pytest.raises(InputError, match=r"^prior_policy\[0, 1\]=0\.0: must be > 0"):
-        evaluate(MDP, POLICY, 1.0, GENERATOR, prior_policy=[[1, 0], [0.5, 0.5]])
+    assert evaluate(MDP, POLICY, 1.0, GENERATOR, prior_policy=[[1, 0], [0.5, 0.5]]).objective == -np.inf
 
 
 # -- solvers' matrices ----------------------------------------------------------------------------------

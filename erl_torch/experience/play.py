@@ -56,15 +56,16 @@ class Draws:
     """Draws actions from a policy [S, A], each with one number of ``rng``.
 
     ``key``: name of a policy that may take only actions that there are; without one, its share of the others is spread.
+    Without ``masked``, what an environment tells of them is passed over.
     """
 
-    def __init__(self, policy: np.ndarray, rng: np.random.Generator, key: str = "") -> None:
-        self._policy, self._rng, self._key = policy, rng, key
+    def __init__(self, policy: np.ndarray, rng: np.random.Generator, key: str = "", masked: bool = True) -> None:
+        self._policy, self._rng, self._key, self._masked = policy, rng, key, masked
         self._cdf = np.cumsum(policy, axis=1)
 
     def __call__(self, s: int, mask: np.ndarray | None = None) -> int:
         """An action in state ``s``, of those in ``mask``. Raises InputError where the policy has none of them."""
-        row = self._cdf[s] if mask is None else self._among(s, mask)
+        row = self._cdf[s] if mask is None or not self._masked else self._among(s, mask)
         return int(row.searchsorted(self._rng.random() * row[-1], side="right"))
 
     def each(self, s: np.ndarray, masks: ActionMasks) -> np.ndarray:

@@ -149,7 +149,7 @@ class Exact:
         if problem.mdp is None:
             allowed = f"one that learns from experience: no model of {problem.name} is known"
             raise InputError("learner", "exact", allowed)
-        return problem.mdp
+        return problem.mdp.restricted(problem.prior > 0)
 
     def position(self, state: ExactState) -> int:
         """Iterations so far."""

@@ -203,8 +203,9 @@ def tabular_mdp(
     mean = np.bincount(row, p * r, n_rows)
     deviation = np.sqrt(np.bincount(row, p * (r - mean[row]) ** 2, n_rows))
     if allowed is not None:
-        allowed = np.asarray(allowed, bool) & ~missing.reshape(n_states, n_actions)
-        deviation *= allowed.ravel()
+        mask = np.asarray(allowed, bool) & ~missing.reshape(n_states, n_actions)
+        deviation *= mask.ravel()
+        allowed = mask
     varies = deviation > 1e-9 * max(1.0, np.abs(r).max())
     if varies.any():
         warnings.warn(

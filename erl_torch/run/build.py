@@ -159,13 +159,17 @@ def make_world(
         return _control_world(cfg, env, safe_point)
     on_end = cfg.get("on_end", "restart")
     checks.one_of("env.on_end", on_end, ("restart", "absorb"))
-    allowed = masks_of(env) if cfg.get("use_action_mask") else None
+    masking = bool(cfg.get("use_action_mask"))
     with group("env"):
         failures = _failures(cfg, env)
-        if known_mdp(env) is not None or not cfg.get("use_model") or not has_table(env):
+        if not reads_table(cfg, env):
             if on_end == "absorb":
                 raise InputError("on_end", on_end, "restart, where there is no model (P) to read")
+            if masking:
+                reason = "there is no model (P) to read, and masks of mdp or info are used in any case"
+                raise InputError("use_action_mask", True, f"false: {reason}")
             return _world_of_steps(cfg, env, failures, beta, prior)
+        allowed = masks_of(env) if masking else None
         end_reward = _end_reward(cfg, env, beta, prior, allowed)
     rule_of_ends = cfg.get("failures", "default")
     mdp = episode = None
@@ -255,13 +259,18 @@ def _world_of_steps(
     return World(source, None, ends=source.rule)
 
 
+def reads_table(cfg: DictConfig, env: gym.Env[Any, Any]) -> bool:
+    """Whether the model of ``env`` is read from its table ``P``."""
+    return known_mdp(env) is None and bool(cfg.get("use_model")) and has_table(env)
+
+
 def masks_of(env: gym.Env[Any, Any]) -> np.ndarray:
     """[S, A] bool: the actions that each state has, as ``action_mask(state)`` of an environment (Taxi's) tells. Raises
     InputError where there is no such method."""
     tell = getattr(env.unwrapped, "action_mask", None)
     if not callable(tell):
-        allowed = "false: the environment has no method action_mask(state) (masks in info are used in any case)"
-        raise InputError("env.use_action_mask", True, allowed)
+        allowed = "false: the environment has no method action_mask(state)"
+        raise InputError("use_action_mask", True, allowed)
     n_states, n_actions = sizes(env)
     rows = [checks.array(f"action_mask({s})", tell(s), (n_actions,)) for s in range(n_states)]
     return np.stack(rows) > 0

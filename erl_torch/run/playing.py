@@ -22,7 +22,7 @@ from erl_torch.learners.replicas import ReplicaSolution
 from erl_torch.mdp.from_gymnasium import sizes
 from erl_torch.mdp.tabular import check_policy
 from erl_torch.rng import streams
-from erl_torch.run.build import make_env
+from erl_torch.run.build import make_env, reads_table
 from erl_torch.run.classes import is_own
 from erl_torch.run.settings import Play, check_keys
 from erl_torch.solution import Solution
@@ -76,7 +76,8 @@ def play(cfg: DictConfig) -> Played:
         table = np.eye(n_actions)[table.argmax(1)]
     with contextlib.closing(make_env(settings.env, mode if mode in modes else None)) as env:
         n_shown = (cfg.n_steps or SHOWN[cfg.render]) if mode in modes or plain_text else 0
-        played = episodes(env, table, cfg.n_episodes, settings.evaluation.horizon, cfg.seed, n_shown)
+        masked = not reads_table(settings.env, env) or bool(settings.env.get("use_action_mask"))
+        played = episodes(env, table, cfg.n_episodes, settings.evaluation.horizon, cfg.seed, n_shown, masked)
         fps = env.metadata.get("render_fps", 10)
     head = f"{settings.env.name}, {settings.learner.name}" + ("" if cfg.replica is None else f", replica {cfg.replica}")
     print(_report(f"{head}{', greedy' * cfg.greedy}, seed {cfg.seed} ({run})", played))
@@ -109,12 +110,18 @@ def _check_named(cfg: DictConfig, settings: DictConfig, run: Path) -> None:
 
 
 def episodes(
-    env: gym.Env[Any, Any], policy: np.ndarray, n_episodes: int, horizon: int, seed: int, n_shown: int = 0
+    env: gym.Env[Any, Any],
+    policy: np.ndarray,
+    n_episodes: int,
+    horizon: int,
+    seed: int,
+    n_shown: int = 0,
+    masked: bool = True,
 ) -> Played:
     """Play ``policy`` [S, A]: episodes of at most ``horizon`` steps, each with its own random stream.
 
     ``n_shown`` steps of the first episode are rendered, in the environment's render mode; without one each is a line of
-    state, action and reward.
+    state, action and reward. ``masked``: of the actions that the environment masks none is taken.
     """
     checks.memory("n_episodes", n_episodes, 17 * n_episodes, "the returns and lengths of all episodes")
     returns, lengths, ended = np.zeros(n_episodes), np.zeros(n_episodes, np.int64), np.zeros(n_episodes, bool)
@@ -123,7 +130,7 @@ def episodes(
     evaluation = streams(seed).evaluation
     for i in range(n_episodes):
         (rng,) = evaluation.spawn(1)
-        first, draw = reset(env, rng), Draws(policy, rng)
+        first, draw = reset(env, rng), Draws(policy, rng, masked=masked)
         if i == 0 and n_shown:
             shown.append(names.state(first.s) if env.render_mode is None else env.render())
             if isinstance(shown[0], np.ndarray):
