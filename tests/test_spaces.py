@@ -21,6 +21,7 @@ from erl_torch import CertaintyEquivalence, InputError, Labels, Note, Problem, T
 from erl_torch.empirical import reservations
 from erl_torch.envs import Discretise
 from erl_torch.envs.encoded import Encoded, EncodedVector, encoded, labels_of
+from erl_torch.envs.ends import EndReward
 from erl_torch.envs.windy_cliff import WindyCliffEnv
 from erl_torch.files import read_npz
 from erl_torch.labels import Names
@@ -347,6 +348,13 @@ def test_a_mask_is_no_part_of_the_state():
                 s, info = vector.reset(options={"reset_mask": terminated})
 
 
+def test_a_bonus_at_the_ends_is_paid_by_any_names():
+    plain = erl_torch.collect(EndReward(Row(), 3.0, "none"), 20, 10, seed=3)
+    assert 4.0 in plain.r
+    named = erl_torch.collect(EndReward(Row(*SPACES["dict"]), 3.0, "none"), 20, 10, seed=3)
+    same_but_for_names("dict", named, plain, SPACES["dict"][0])
+
+
 # -- names come back -------------------------------------------------------------------------------------------
 
 
@@ -591,6 +599,14 @@ def test_a_wrong_step_is_named(arguments, words):
     assert "\n" not in str(error.value)
     with pytest.raises(InputError, match=r"^Wrong, step 2 of an episode: "):
         erl_torch.evaluate(Wrong(**arguments), np.full((5, 2), 0.5), 1.0, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("arguments", [one for one, _ in WRONG[6:9] + WRONG[10:16]])
+@pytest.mark.parametrize("wrap", [Encoded, partial(EndReward, end_reward=1.0, failures="none")])
+def test_wrappers_do_not_hide_a_wrong_step(wrap, arguments):
+    with pytest.raises(InputError, match=r"^Wrong, step 2 of an episode: ") as error:
+        erl_torch.collect(wrap(Wrong(**arguments)), 2, 5)
+    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize(("first", "words"), FIRST)
@@ -875,6 +891,39 @@ def test_tables_are_read_as_they_are_meant(table):
     absorbed = erl_torch.tabular_mdp(env, on_end="absorb")
     np.testing.assert_allclose(absorbed.transition.toarray().reshape(3, 2, 3)[2], [[0, 0, 1]] * 2)
     assert (absorbed.reward[2] == 0).all()
+
+
+@pytest.mark.filterwarnings("ignore::erl_torch.MeanRewardWarning")
+@pytest.mark.parametrize(
+    "row",
+    [
+        {0: GO},
+        {0: GO, 1: []},
+        {0: GO, 1: None},
+        {0: GO, 1: [(0.0, 0, 5.0, False)]},
+        {0: GO, 1: [(1.0, 0, -np.inf, False)]},
+        {0: GO, 1: [(0.5, 0, 1.0, False), (0.5, 2, -np.inf, True)]},
+        [GO, ()],
+    ],
+    ids=["absent", "empty", "none", "probability 0", "-inf", "a part -inf", "tuple"],
+)
+@pytest.mark.parametrize("on_end", ["restart", "absorb"])
+def test_missing_actions_are_missing(row, on_end):
+    table = {0: row, 1: PLAIN[1]}
+    transition, reward = model_by_hand()
+    mdp = erl_torch.tabular_mdp(Table(table, [1, 0, 0]), on_end)
+    np.testing.assert_array_equal(mdp.allowed, [[True, False], [True, True], [True, True]])
+    if on_end == "restart":
+        dense = mdp.transition.toarray().reshape(3, 2, 3)
+        np.testing.assert_allclose(dense[1], transition[1])
+        np.testing.assert_allclose(dense[0, 0], transition[0, 0])
+        np.testing.assert_allclose(mdp.reward[mdp.allowed], [0.5, 0.75, 0.5, 0, 0])
+        best = erl_torch.solve_soft_bellman(mdp, 3.0)
+        # State 0 goes on surely; the uniform prior of one action costs nothing.
+        alone = TabularMDP([[[0.0, 1.0]] * 2, [[1.0, 0.0], [0.0, 1.0]]], [[0.5, 0.5], reward[1]], [1.0, 0.0])
+        assert best.theta is not None
+        np.testing.assert_allclose(best.theta, erl_torch.solve_soft_bellman(alone, 3.0).theta, rtol=1e-9)
+        assert best.policy[0].tolist() == [1.0, 0.0]
 
 
 @pytest.mark.filterwarnings("ignore::erl_torch.MeanRewardWarning")

@@ -8,6 +8,7 @@ import gymnasium as gym
 
 from erl_torch import checks
 from erl_torch.checks import InputError
+from erl_torch.envs.encoded import encoded
 from erl_torch.mdp.ends import EndRule, Failures, Rule
 from erl_torch.mdp.from_gymnasium import best_end, sizes
 
@@ -19,7 +20,7 @@ class EndReward(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs
     step says which it was. Truncated episodes have not ended.
 
     Args:
-        env: with Discrete spaces.
+        env: with finite spaces; they are Discrete then.
         end_reward: reward, finite.
         failures: the rule; "default" needs an environment that tells how its ends pay (a table ``P``, or this
             package's).
@@ -30,7 +31,7 @@ class EndReward(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs
 
     def __init__(self, env: gym.Env[Any, Any], end_reward: float, failures: Rule = "default") -> None:
         gym.utils.RecordConstructorArgs.__init__(self, end_reward=end_reward, failures=failures)
-        super().__init__(env)
+        super().__init__(env := encoded(env))
         rule = Failures.of(failures, best_end(env), sizes(env)[0])
         self.rule = EndRule(rule, checks.finite("end_reward", end_reward))
         if end_reward < 0 and rule.limit == -float("inf") and not rule.states:

@@ -27,7 +27,16 @@ from erl_torch.mdp.masks import ActionMasks
 from erl_torch.rng import Streams
 
 CHUNK = 10_000  # tuples
-BETWEEN = ("gymnasium.wrappers", "gymnasium.core", "gymnasium.vector", "gymnasium.utils.passive_env")
+# Modules that stand between: what they stumble over is what an environment returned.
+BETWEEN = (
+    "gymnasium.wrappers",
+    "gymnasium.core",
+    "gymnasium.vector",
+    "gymnasium.utils.passive_env",
+    "erl_torch.envs.discretise",
+    "erl_torch.envs.encoded",
+    "erl_torch.envs.ends",
+)
 RESET = "(observation, info), info a dict"
 STEP = "(observation, reward, terminated, truncated, info)"
 INTERFACE = f"one of Gymnasium's: reset(seed=None, options=None) -> (observation, info), step(action) -> {STEP}"
@@ -359,7 +368,7 @@ def _name(env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]) -> str:
 def _blamed(env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any], when: str) -> Iterator[None]:
     """Complaints raised inside name the environment and ``when``.
 
-    So do those of Gymnasium's own wrappers, which stand between and take what the environment returns apart.
+    So do those of wrappers that stand between and take what the environment returns apart.
     """
     try:
         yield

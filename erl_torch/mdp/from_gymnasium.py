@@ -202,10 +202,10 @@ def tabular_mdp(
         raise InputError(f"start[{lost[0]}]", first[lost[0]], "0, as P has no entries for this state")
     mean = np.bincount(row, p * r, n_rows)
     deviation = np.sqrt(np.bincount(row, p * (r - mean[row]) ** 2, n_rows))
+    mask = ~missing.reshape(n_states, n_actions)
     if allowed is not None:
-        mask = np.asarray(allowed, bool) & ~missing.reshape(n_states, n_actions)
+        mask &= checks.array("allowed", allowed, (n_states, n_actions)) != 0
         deviation *= mask.ravel()
-        allowed = mask
     varies = deviation > 1e-9 * max(1.0, np.abs(r).max())
     if varies.any():
         warnings.warn(
@@ -218,13 +218,12 @@ def tabular_mdp(
     on = sp.coo_array((p[~end], (row[~end], to[~end])), shape=shape)
     # A state without entries is never stepped from; its row has to lead somewhere.
     from_start = sp.csr_array(silent.astype(np.float64)[:, None]) @ sp.csr_array(first[None, :])
-    mean[missing] = -np.inf
     if on_end == "restart":
         ending = np.bincount(row[end], p[end], n_rows)
         transition = on + sp.csr_array(ending[:, None]) @ sp.csr_array(first[None, :]) + from_start
-        return TabularMDP(transition, mean.reshape(n_states, n_actions), first, allowed=allowed)  # type: ignore[arg-type]
+        return TabularMDP(transition, mean.reshape(n_states, n_actions), first, allowed=mask)
     transition = on + sp.coo_array((p[end], (row[end], to[end])), shape=shape) + from_start
-    mdp = TabularMDP(transition, mean.reshape(n_states, n_actions), first, allowed=allowed)  # type: ignore[arg-type]
+    mdp = TabularMDP(transition, mean.reshape(n_states, n_actions), first, allowed=mask)
     # States that no episode comes to do not count: Taxi's table has rows for them too.
     seen = _come_to(row[~end] // n_actions, to[~end], first)
     terminal = np.setdiff1d(to[end], np.flatnonzero(seen))
