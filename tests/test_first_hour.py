@@ -406,7 +406,7 @@ def estimate(value, sd):
     [
         ([1.0] * 20, solution(1.0), estimate(1.01, 0.02), "Yes, as far as the data can tell"),
         ([1.0] * 20, solution(1.0), estimate(1.1, 0.02), "It has settled, but outside"),
-        ([*[1.0] * 19, 1.2], solution(1.2), estimate(1.2, 0.02), "Not yet"),
+        ([*[1.0] * 19, 1.2], solution(1.2), estimate(1.2, 0.02), "Not settled"),
         ([1.0] * 20, solution(1.0), None, "Whether at theta*, no data tell"),
         ([1.0], solution(1.0, (0.9999, 1.0001)), None, "Yes: theta is inside its proven bounds"),
         ([1.0], solution(1.0, (-np.inf, np.inf)), None, "It has settled. Whether"),
