@@ -113,9 +113,9 @@ def test_the_newcomer_s_path(tmp_path, typed_here, monkeypatch):
     """The page's module and commands; theta and policy against the model, written down by hand."""
     page = (ROOT / "docs" / "getting-started.md").read_text()
     (tmp_path / "my_module.py").write_text(
-        re.search(r"<!-- file: my_module.py -->\n```python\n(.*?)```", page, re.S)[1]
+        re.search(r"<!-- newcomer: my_module.py -->\n```python\n(.*?)```", page, re.S)[1]
     )
-    train, play, _ = re.search(r"<!-- commands -->\n```bash\n(.*?)```", page, re.S)[1].splitlines()
+    train, play, _ = re.search(r"<!-- newcomer: commands -->\n```bash\n(.*?)```", page, re.S)[1].splitlines()
     monkeypatch.syspath_prepend(tmp_path)
     for line in (train, play):
         program, command, *arguments = shlex.split(line)
