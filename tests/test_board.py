@@ -302,8 +302,12 @@ def test_api_has_tags_boards_and_columns(runs, tensorboard):
     root, kinds = runs
     directories = {path.parent for path in root.rglob("*tfevents*")}  # those of constants, too
     ask = tensorboard(root, len(directories))
-    tags = {run: set(found) for run, found in ask("plugin/scalars/tags").items()}
-    assert tags == {str(path.relative_to(root)): set(events(path).Tags()["scalars"]) for path in directories}
+    tags = {str(path.relative_to(root)): set(events(path).Tags()["scalars"]) for path in directories}
+
+    def read():
+        return {run: set(found) for run, found in ask("plugin/scalars/tags").items()}
+
+    wait_until(lambda: read() == tags, "all tags")  # it knows of a run before it has read it to the end
     last = ask("plugin/scalars/scalars?run=s1&tag=learner/theta")[-1]
     assert last[1:] == [kinds["s1"]["n_tuples"], pytest.approx(kinds["s1"]["theta"], rel=1e-6)]
 
