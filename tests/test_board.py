@@ -314,7 +314,8 @@ def test_api_has_tags_boards_and_columns(runs, tensorboard):
     boards = {category["title"]: category["chart"] for category in ask("plugin/custom_scalars/layout")["category"]}
     assert list(boards) == [CONVERGENCE, BIAS, RETURNS]
     titles = {chart["title"] for charts in boards.values() for chart in charts}
-    assert {title for charts in board.charts(alone=True).values() for title in charts} <= titles
+    missing = {title for charts in board.charts(alone=True).values() for title in charts} - titles
+    assert missing <= {"success rate"}  # of environments whose episodes end
     written = set().union(*tags.values())
     for chart in (chart for charts in boards.values() for chart in charts):
         for band in chart.get("margin", {}).get("series", []):
