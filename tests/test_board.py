@@ -300,16 +300,22 @@ def tensorboard(tmp_path, start):
 
 def test_api_has_tags_boards_and_columns(runs, tensorboard):
     root, kinds = runs
-    ask = tensorboard(root, len(kinds))
-    tags = {run: set(found) for run, found in ask("plugin/scalars/tags").items()}
-    assert tags == {name: set(events(root / name).Tags()["scalars"]) for name in kinds}
+    directories = {path.parent for path in root.rglob("*tfevents*")}  # those of constants, too
+    ask = tensorboard(root, len(directories))
+    tags = {str(path.relative_to(root)): set(events(path).Tags()["scalars"]) for path in directories}
+
+    def read():
+        return {run: set(found) for run, found in ask("plugin/scalars/tags").items()}
+
+    wait_until(lambda: read() == tags, "all tags")  # it knows of a run before it has read it to the end
     last = ask("plugin/scalars/scalars?run=s1&tag=learner/theta")[-1]
     assert last[1:] == [kinds["s1"]["n_tuples"], pytest.approx(kinds["s1"]["theta"], rel=1e-6)]
 
     boards = {category["title"]: category["chart"] for category in ask("plugin/custom_scalars/layout")["category"]}
     assert list(boards) == [CONVERGENCE, BIAS, RETURNS]
     titles = {chart["title"] for charts in boards.values() for chart in charts}
-    assert {title for charts in board.charts().values() for title in charts} <= titles
+    missing = {title for charts in board.charts(alone=True).values() for title in charts} - titles
+    assert missing <= {"success rate"}  # of environments whose episodes end
     written = set().union(*tags.values())
     for chart in (chart for charts in boards.values() for chart in charts):
         for band in chart.get("margin", {}).get("series", []):

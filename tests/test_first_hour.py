@@ -13,11 +13,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from helpers import ROOT
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hypothesis import given
 from hypothesis import strategies as st
 
-from erl_torch import Solution, Status, TabularMDP, compiled, pictures
+from erl_torch import Solution, Status, TabularMDP, compiled, pictures, solve_soft_bellman
 from erl_torch.cli import main as cli
 from erl_torch.cli import paths, sweeps
 from erl_torch.cli.typed import Typed
@@ -105,6 +106,33 @@ def test_own_environments_are_named_by_module_and_id_or_class(tmp_path, typed_he
     assert code == 1
     assert err.endswith(f"add {named}\n")
     assert typed_here("play.py", "run=run", "n_episodes=1", named)[0] == 0
+
+
+@pytest.mark.slow
+def test_the_newcomer_s_path(tmp_path, typed_here, monkeypatch):
+    """The page's module and commands; theta and policy against the model, written down by hand."""
+    page = (ROOT / "docs" / "getting-started.md").read_text()
+    (tmp_path / "my_module.py").write_text(
+        re.search(r"<!-- newcomer: my_module.py -->\n```python\n(.*?)```", page, re.S)[1]
+    )
+    train, play, _ = re.search(r"<!-- newcomer: commands -->\n```bash\n(.*?)```", page, re.S)[1].splitlines()
+    monkeypatch.syspath_prepend(tmp_path)
+    for line in (train, play):
+        program, command, *arguments = shlex.split(line)
+        assert program == "erl-torch"
+        assert typed_here(f"{command}.py", *arguments)[0] == 0
+    transition, reward = np.zeros((5, 2, 5)), np.zeros((5, 2))
+    for s in range(5):
+        for a in range(2):
+            items = min(s + a, 4)
+            p_sold = 0.5 * (items > 0)
+            transition[s, a, max(items - 1, 0)] += p_sold
+            transition[s, a, items] += 1 - p_sold
+            reward[s, a] = p_sold - 0.6 * a
+    best = solve_soft_bellman(TabularMDP(transition, reward), 10.0)
+    learnt = Solution.load(tmp_path / "runs" / "shelf" / "solution.npz")
+    assert learnt.theta == pytest.approx(best.theta, abs=0.01)  # the data's interval is +- .003
+    assert learnt.policy.numpy() == pytest.approx(best.policy.numpy(), abs=0.05)
 
 
 @pytest.mark.slow
@@ -378,7 +406,7 @@ def estimate(value, sd):
     [
         ([1.0] * 20, solution(1.0), estimate(1.01, 0.02), "Yes, as far as the data can tell"),
         ([1.0] * 20, solution(1.0), estimate(1.1, 0.02), "It has settled, but outside"),
-        ([*[1.0] * 19, 1.2], solution(1.2), estimate(1.2, 0.02), "Not yet"),
+        ([*[1.0] * 19, 1.2], solution(1.2), estimate(1.2, 0.02), "Not settled"),
         ([1.0] * 20, solution(1.0), None, "Whether at theta*, no data tell"),
         ([1.0], solution(1.0, (0.9999, 1.0001)), None, "Yes: theta is inside its proven bounds"),
         ([1.0], solution(1.0, (-np.inf, np.inf)), None, "It has settled. Whether"),

@@ -102,7 +102,7 @@ def make_env(cfg: DictConfig, render_mode: str | None = None) -> gym.Env[Any, An
             arguments = settings_of(keys, kind, OF_NO_ENV)
         if isinstance(arguments.get("wind"), str):
             arguments["wind"] = read_npy(arguments["wind"], "wind")
-        shown = {} if render_mode is None else {"render_mode": render_mode}
+        shown: dict[str, Any] = {} if render_mode is None else {"render_mode": render_mode}
         try:
             if isinstance(spec, EnvSpec):  # its arguments may have the names of gymnasium.make's own
                 spec.kwargs = arguments

@@ -78,7 +78,8 @@ def _answer(solution: Solution, settled: bool, away: float | None) -> str:
     if low <= solution.theta <= high and high - low <= SMALL_MOVE * abs(solution.theta):
         return "Yes: theta is inside its proven bounds."
     if not settled:
-        return "Not yet: theta still moves."
+        constant = " Constant steps do so however long they run." if solution.status is Status.COMPLETED else ""
+        return f"Not settled: theta still moves.{constant}"
     if away is None:
         return "It has settled. Whether at theta*, no data tell."
     if away <= 1:
