@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 
+from erl_torch.labels import Labels
 from erl_torch.mdp.masks import ActionMasks
 from erl_torch.mdp.tabular import TabularMDP
 
@@ -18,27 +19,30 @@ Policy: TypeAlias = torch.Tensor
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """An environment with finite spaces, and what is known of it.
+    """An environment with finite spaces, and what is known of it; or what a log alone tells (``erl_torch.read_log``).
 
     Args:
-        env: where policies are played.
-        source: where experience is collected: ``env``, or a model in its place.
+        env: where policies are played; None: a log is all that there is.
+        source: where experience is collected: ``env``, or a model in its place; None with ``env``.
         prior: the prior policy, [S, A], rows sum to 1; 0 where a state does not have the action.
         mdp: the model that policies are evaluated on, and that is solved to compare with; None where it is not known.
         episode: the model of one episode: its end is absorbed, without reward; None where there is none.
         horizon: steps of an episode at most, >= 1.
         name: what messages and pictures call it.
         masks: where the actions of each state are noted, as ``env`` tells them; None where it does not.
+        state_labels, action_labels: of the numbers of states and actions; None: they have no other names.
     """
 
-    env: gym.Env[Any, Any]
-    source: TabularMDP | gym.Env[Any, Any]
+    env: gym.Env[Any, Any] | None
+    source: TabularMDP | gym.Env[Any, Any] | None
     prior: np.ndarray
     mdp: TabularMDP | None = None
     episode: TabularMDP | None = None
     horizon: int = 1000
     name: str = "the environment"
     masks: ActionMasks | None = None
+    state_labels: Labels | None = None
+    action_labels: Labels | None = None
 
     @property
     def allowed(self) -> np.ndarray:

@@ -13,6 +13,7 @@ ROOT = Path(__file__).parents[1] / "erl_torch"
 # From the ground up; a folder may import from those on lines above its own.
 FLOORS = (
     {"lazy", "checks", "configurations", "notes", "output", "rng", "files", "parallel", "pictures", "log"},
+    {"labels"},
     {"solution", "mdp", "problem"},
     {"envs", "solvers"},
     {"experience"},
