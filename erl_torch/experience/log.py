@@ -12,6 +12,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -127,9 +128,14 @@ class Log:
     """A log, read: what there is to learn, what from, and a report of it."""
 
     problem: Problem  # without an environment
-    experience: Transitions | FileRecording
+    recording: FileRecording
     report: LogReport
     visits: np.ndarray  # n(s,a), [S, A]
+
+    @cached_property
+    def experience(self) -> Transitions | FileRecording:
+        """The tuples, in memory where ``chunk`` of them are enough."""
+        return self.recording.held()
 
     @property
     def n_states(self) -> int:
@@ -204,7 +210,7 @@ def read_log(
         action_labels=actions.labels,
     )
     told_of = _report(source, roles, states, actions, counts, reader.seen, unseen_actions, bool(stride))
-    return Log(problem, recording.held(), told_of, counts.visits)
+    return Log(problem, recording, told_of, counts.visits)
 
 
 def prior_of(visits: np.ndarray, unseen_actions: str) -> np.ndarray:

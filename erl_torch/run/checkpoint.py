@@ -36,7 +36,7 @@ from erl_torch.solution import Solution, Status
 FORMAT = 3  # 1 knew no settings, 2 no types of NumPy's numbers
 KEPT = 2
 RESULTS = ("result.json", "solution.npz", "replicas.npz")
-FILES = ("settings.json", *RESULTS, "bands.png", "sweep.png")  # that a run writes under names of its own
+FILES = ("settings.json", *RESULTS, "bands.png", "sweep.png", "policy.csv")  # that a run writes under names of its own
 FREE = ("threads", "checkpoint_every")  # settings that no result depends on
 COMMON = (Evaluation, NonFiniteError, Solution, Status)  # classes that any checkpoint may hold
 Content = dict[str, Any]

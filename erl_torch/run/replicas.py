@@ -17,7 +17,8 @@ from erl_torch.empirical.reservations import Counted, Reservation
 from erl_torch.empirical.uncertainty import Estimate
 from erl_torch.evaluation import Judge, evaluate
 from erl_torch.experience.collect import COLUMN_BYTES
-from erl_torch.experience.simulation import KEEP_BYTES, ReplicaExperience, Simulation, longest
+from erl_torch.experience.log import Log
+from erl_torch.experience.simulation import KEEP_BYTES, ReplicaExperience, Simulation, longest, streams_of
 from erl_torch.experience.transitions import Transitions
 from erl_torch.files import write_png
 from erl_torch.learners.learner import NonFiniteError, StreamLearner
@@ -30,7 +31,15 @@ from erl_torch.problem import Problem
 from erl_torch.rng import streams
 from erl_torch.run.checkpoint import Content
 from erl_torch.run.groups import MOST_LOGGED, Group, Record, setting_text, statistics
-from erl_torch.run.judge import SMALL, EvaluationSettings, episode_model, judging_model, of_data
+from erl_torch.run.judge import (
+    SMALL,
+    DataJudge,
+    EvaluationSettings,
+    data_judge,
+    episode_model,
+    judging_model,
+    of_data,
+)
 from erl_torch.run.loop import Outcome, Row, SafePoint
 from erl_torch.run.report import Title, ended_as, last_rows, plural, versions
 from erl_torch.solution import Status
@@ -52,6 +61,7 @@ class ReplicaRecorder:
         settings: what is measured.
         title: names, for result, pictures and summary.
         safe_point: called between streams that are read; may raise.
+        log: where it is all that there is.
     """
 
     replicas: Replicas
@@ -63,11 +73,14 @@ class ReplicaRecorder:
     settings: EvaluationSettings
     title: Title
     safe_point: SafePoint
+    log: Log | None = None
 
     def __post_init__(self) -> None:
         learners = self.replicas.learners
         betas = [learner.beta for learner in learners]
-        self.judges = Judges(self.problem, self.settings, betas, self.seeds, self.replicas.workers)
+        self.judges = Judges(
+            self.problem, self.settings, betas, self.seeds, self.replicas.workers, _judges_of(self.problem, self.experience)
+        )
         texts, self.data = reservations_of(
             self.experience, learners, self.problem.prior, self.judges.model, self.settings.certify, self.safe_point
         )
@@ -213,6 +226,7 @@ class ReplicaRecorder:
             "n_tuples": outcome.state.work,
             "seconds_learning": round(outcome.seconds, 3),
             "versions": versions(),
+            **({} if self.log is None else {"log": self.log.report.content()}),
         }
 
     def _half_widths(self, solution: ReplicaSolution) -> dict[str, float] | None:
@@ -265,7 +279,9 @@ class Judges:
         betas: Sequence[float],
         seeds: Sequence[int],
         threads: int,
+        of_data: Sequence[DataJudge | None] = (),
     ) -> None:
+        self.of_data = of_data
         self.problem, self.betas, self.n_episodes, self.threads = problem, betas, settings.n_episodes, threads
         self.rngs = [streams(seed).evaluation for seed in seeds]
         self.model = judging_model(problem, settings)
@@ -319,6 +335,13 @@ class Judges:
                 figures["return"] = self.problem.horizon * figures["reward_per_step"]
             else:
                 figures["return"] = self.problem.horizon * each(lambda r: self.of_episode.reward_per_step(policies[r]))
+        elif self.problem.env is None:
+            figures["objective"] = np.array(
+                [
+                    np.nan if judge is None else judge.objective(policy, beta)
+                    for judge, policy, beta in zip(self.of_data * len(policies), policies, self.betas, strict=False)
+                ]
+            )
         elif milestone:
             played = [
                 evaluate(self.problem.env, policy, beta, rng, self.n_episodes, self.problem.horizon, self.problem.prior)
@@ -329,6 +352,13 @@ class Judges:
                 figures["reward_per_step"] = np.array([one.reward_per_step for one in played])
                 figures["objective"] = np.array([one.objective for one in played])
         return figures
+
+
+def _judges_of(problem: Problem, experience: ReplicaExperience) -> list[DataJudge | None]:
+    """What the streams themselves say of policies, one or one per replica, where there is nothing else; else none."""
+    if problem.env is not None or isinstance(experience, Simulation):
+        return []
+    return [data_judge(data, *problem.prior.shape, problem.prior) for data in streams_of(experience)]
 
 
 class Data(NamedTuple):

@@ -20,6 +20,7 @@ from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.envs.tabular import TabularEnv
 from erl_torch.experience.experience import EXPERIENCE, Experience, permitted
+from erl_torch.experience.log import Log
 from erl_torch.experience.simulation import ReplicaExperience, Simulation, digest, longest
 from erl_torch.experience.sources import Source
 from erl_torch.experience.transitions import Transitions
@@ -45,7 +46,7 @@ from erl_torch.run.single import SingleRecorder
 from erl_torch.solution import Solution
 
 KINDS = (Simulation, list, tuple)  # of experience that replicas take besides
-Given = Problem | TabularMDP | gym.Env[Any, Any]
+Given = Problem | TabularMDP | gym.Env[Any, Any] | Log
 
 
 @overload
@@ -102,9 +103,10 @@ def train(
         learner: one learner, an exact solver, or ``Replicas``.
         problem: an environment of Gymnasium's with finite spaces, a model, or a ``Problem`` of both. Where the model is
             known, policies are evaluated on it and the solution is certified; of an environment with a table ``P`` give
-            ``tabular_mdp(env)``. Of a ``Problem`` its own horizon counts.
+            ``tabular_mdp(env)``. Of a ``Problem`` its own horizon counts. Or a ``Log``, as of ``read_log``: only what
+            the data say is then written.
         experience: tuples to learn from, or a ``Source`` of them; of ``Replicas`` also one stream per replica, or a
-            ``Simulation``. None of an exact solver.
+            ``Simulation``. None of an exact solver, and of a ``Log``.
         directory: of the run; made if it is missing.
         seed: of the source, and of episodes that are played; replicas have ``seed``, ``seed + 1``, ...
         evaluation: what is measured of the policy while it learns; None is ``EvaluationSettings()``.
@@ -119,6 +121,9 @@ def train(
     began = time.perf_counter()
     seed = checks.at_least("seed", seed, 0)
     settings = EvaluationSettings() if evaluation is None else evaluation
+    log = problem if isinstance(problem, Log) else None
+    if log is not None and experience is None:
+        experience = log.experience if isinstance(learner, Replicas) else log.recording
     one = _checked(learner, experience, settings, checkpoint_every)
     many = isinstance(learner, Replicas)
     given = _problem(problem, one.prior_policy, settings.horizon)
@@ -140,7 +145,7 @@ def train(
             experience = learner.permitted(experience, given.n_states, given.n_actions, note)
             learner.check(experience, given.n_states, given.n_actions)
             groups, vary = groups_among(learner.learners)
-            recorder = ReplicaRecorder(learner, given, experience, groups, seeds, vary, settings, title, lambda: None)
+            recorder = ReplicaRecorder(learner, given, experience, groups, seeds, vary, settings, title, lambda: None, log)
             n_experience = longest(experience)
         else:
             if isinstance(experience, Source):
@@ -152,7 +157,7 @@ def train(
                 learner, given = as_told(learner, given)
                 experience = permitted(experience, given.prior, learner.drawn_from_prior == "a_next", note)
             rng = streams(seed).evaluation
-            recorder = SingleRecorder(learner, given, experience, settings, rng, title, n_skipped)
+            recorder = SingleRecorder(learner, given, experience, settings, rng, title, n_skipped, log)
             n_experience = 0 if experience is None else len(experience)
         run: Run[Any, Any, Any] = Run(
             learner=learner,
@@ -213,6 +218,8 @@ def _checked(
 
 def _problem(given: Given, prior_policy: Table, horizon: int) -> Problem:
     """As a ``Problem``, with the prior of the learner. Raises InputError."""
+    if isinstance(given, Log):
+        given = given.problem
     if isinstance(given, Problem):
         prior = check_policy("learner.prior_policy", prior_policy, given.n_states, given.n_actions, given.allowed)
         return replace(given, prior=prior, masks=ActionMasks(given.n_states, given.n_actions))
@@ -277,8 +284,10 @@ def _described(
     }
 
 
-def _environment(env: gym.Env[Any, Any]) -> dict[str, Any]:
+def _environment(env: gym.Env[Any, Any] | None) -> dict[str, Any]:
     """Class, id and arguments, as far as Gymnasium knows them."""
+    if env is None:
+        return {"environment": "none"}
     kind = type(env.unwrapped)
     spec = {} if env.spec is None else {"id": env.spec.id, "kwargs": _plain(env.spec.kwargs)}
     return {"environment": f"{kind.__module__}.{kind.__qualname__}", **spec}
