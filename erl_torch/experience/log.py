@@ -22,8 +22,11 @@ from numpy.typing import ArrayLike
 from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.experience.formats import ALLOWED, FORMATS, minari, npy, rows
+from erl_torch.experience.formats.encoding import Encoding, Met, truth
 from erl_torch.experience.formats.format import Options
-from erl_torch.experience.formats.rows import Encoding, Met, Roles, Rows, Seen, in_order, roles_of, stride_of
+from erl_torch.experience.formats.order import in_order, stride_of
+from erl_torch.experience.formats.roles import Roles, roles_of
+from erl_torch.experience.formats.rows import Rows, Seen
 from erl_torch.experience.formats.table import Cells, InOrder, Table, is_frame, of_frame, of_npz, open_table
 from erl_torch.experience.recording import CHUNK, READ, FileRecording, Recordable
 from erl_torch.experience.transitions import COLUMNS, Transitions
@@ -163,8 +166,8 @@ def read_log(
     Args:
         path: of a CSV, Parquet, JSON-lines or npz file, a directory of such parts or of npy columns, or
             ``minari:DATASET``; or a frame of pandas or polars, a table of Arrow, arrays by name.
-        columns: which columns are which, as {"s": "segment", "r": "profit"}; several make tuples, {"s": ["x", "y"]}; the
-            others are found by their usual names (``erl_torch.experience.formats.rows``).
+        columns: which columns are which, as {"s": "segment", "r": "profit"}; several make tuples, {"s": ["x", "y"]};
+            the others are found by their usual names (``erl_torch.experience.formats.roles``).
         unseen_actions: "missing": a state lacks the actions that no row has in it; "allowed": it may have them.
         prior_policy: [S, A], in the order of the labels; None is uniform over the actions that a state has.
         on_bad: "stop" or "skip", for bad rows.
@@ -248,7 +251,7 @@ def table_of(path: Recordable) -> Table:
 class Tuples(InOrder):
     """What a reader of the five columns reads, as a table."""
 
-    names = COLUMNS
+    names: Sequence[str] = COLUMNS
 
     def __init__(self, reader: Any) -> None:
         self.path, self._reader = reader.path, reader
@@ -284,7 +287,7 @@ def _encodings(source: Table, roles: Roles, strict: bool, told: Callable[[int], 
         parts = {role: [found[name] for name in columns] for role, columns in roles.items()}
         everywhere = np.ones(parts["s"][0].n_rows, bool)
         # The state after the end of an episode is none that anything leads to.
-        goes_on = rows.truth(parts["terminated"][0]) != 1 if "terminated" in parts else everywhere
+        goes_on = truth(parts["terminated"][0]) != 1 if "terminated" in parts else everywhere
         for met, role, where in (
             (states, "s", everywhere),
             (states, "s_next", goes_on),

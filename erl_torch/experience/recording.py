@@ -90,9 +90,7 @@ class FileRecording:
         n_states, n_actions = checks.at_least("n_states", n_states, 1), checks.at_least("n_actions", n_actions, 1)
         if n_states * n_actions > np.iinfo(np.int32).max:
             raise InputError("n_states * n_actions", n_states * n_actions, "below 2**31")
-        options = Options(
-            n_states, n_actions, env, prior_policy, on_prior, seed, columns, state_labels, action_labels
-        )
+        options = Options(n_states, n_actions, env, prior_policy, on_prior, seed, columns, state_labels, action_labels)
         self._reader = _reader(path, options, format)
         self._chunk, self._strict = chunk, on_bad == "stop"
         self._sizes = n_states, n_actions

@@ -85,6 +85,8 @@ class Simulate(Source):
         return self.n_episodes * self.episode_length
 
     def __call__(self, problem: Problem, seed: int, report: Report) -> Experience:
+        if problem.source is None:
+            raise InputError("experience", type(self).__name__, "recorded: there is no environment to collect from")
         sizes = self.n_episodes, self.episode_length
         behaviour = self._behaviour()
         if self.save_to is None:

@@ -109,9 +109,9 @@ class DataJudge:
         return Judge(mdp, problem.prior, 1), problem.states, used
 
 
-def data_judge(data: Experience, n_states: int, n_actions: int, prior: np.ndarray) -> DataJudge | None:
+def data_judge(data: Experience, prior: np.ndarray) -> DataJudge | None:
     """Of a stream; None where the squares of its rewards overflow."""
-    model = reservations.count(data, n_states, n_actions, False).model
+    model = reservations.count(data, prior.shape[0], prior.shape[1], False).model
     return None if model is None else DataJudge(model, prior)
 
 
@@ -126,5 +126,7 @@ def judging_model(problem: Problem, settings: EvaluationSettings) -> TabularMDP 
 def episode_model(problem: Problem) -> TabularMDP | None:
     """The model whose rewards over the horizon are an episode's return; None where there is none."""
     env = problem.env
+    if env is None:
+        return problem.episode
     endless = known_mdp(env) is not None and not ending_states(env, problem.n_states).any()
     return problem.episode or (problem.mdp if endless else None)

@@ -56,7 +56,7 @@ def play(cfg: DictConfig) -> Played:
     settings = run_settings(run)
     _check_named(cfg, settings, run)
     if is_log(settings.env):
-        allowed = f"one with an environment: it learnt from a log alone, and there is none to play in; see {run}/policy.csv"
+        allowed = f"one with an environment: a log alone has none to play in; its policy is in {run / 'policy.csv'}"
         raise InputError("run", run, allowed)
     table = run_policy(run, cfg.replica)
     mode = MODES.get(cfg.render)

@@ -79,7 +79,12 @@ class ReplicaRecorder:
         learners = self.replicas.learners
         betas = [learner.beta for learner in learners]
         self.judges = Judges(
-            self.problem, self.settings, betas, self.seeds, self.replicas.workers, _judges_of(self.problem, self.experience)
+            self.problem,
+            self.settings,
+            betas,
+            self.seeds,
+            self.replicas.workers,
+            _judges_of(self.problem, self.experience),
         )
         texts, self.data = reservations_of(
             self.experience, learners, self.problem.prior, self.judges.model, self.settings.certify, self.safe_point
@@ -281,7 +286,7 @@ class Judges:
         threads: int,
         of_data: Sequence[DataJudge | None] = (),
     ) -> None:
-        self.of_data = of_data
+        self.of_data = list(of_data)
         self.problem, self.betas, self.n_episodes, self.threads = problem, betas, settings.n_episodes, threads
         self.rngs = [streams(seed).evaluation for seed in seeds]
         self.model = judging_model(problem, settings)
@@ -336,10 +341,11 @@ class Judges:
             else:
                 figures["return"] = self.problem.horizon * each(lambda r: self.of_episode.reward_per_step(policies[r]))
         elif self.problem.env is None:
+            judges = self.of_data * len(policies) if len(self.of_data) == 1 else self.of_data
             figures["objective"] = np.array(
                 [
                     np.nan if judge is None else judge.objective(policy, beta)
-                    for judge, policy, beta in zip(self.of_data * len(policies), policies, self.betas, strict=False)
+                    for judge, policy, beta in zip(judges, policies, self.betas, strict=True)
                 ]
             )
         elif milestone:
@@ -358,7 +364,7 @@ def _judges_of(problem: Problem, experience: ReplicaExperience) -> list[DataJudg
     """What the streams themselves say of policies, one or one per replica, where there is nothing else; else none."""
     if problem.env is not None or isinstance(experience, Simulation):
         return []
-    return [data_judge(data, *problem.prior.shape, problem.prior) for data in streams_of(experience)]
+    return [data_judge(data, problem.prior) for data in streams_of(experience)]
 
 
 class Data(NamedTuple):

@@ -38,7 +38,7 @@ def evaluation_tags(measured: Evaluation, prefix: str = "eval") -> dict[str, flo
 
 
 def figures(measured: Evaluation) -> dict[str, float]:
-    """By name, as in ``erl_torch.log.quantities``; those that there are, as a log alone tells of an objective at most."""
+    """By name, as in ``erl_torch.log.quantities``; those that there are: a log alone tells of an objective at most."""
     found = {
         "return": measured.mean_return,
         "reward_per_step": measured.reward_per_step,

@@ -145,7 +145,8 @@ def train(
             experience = learner.permitted(experience, given.n_states, given.n_actions, note)
             learner.check(experience, given.n_states, given.n_actions)
             groups, vary = groups_among(learner.learners)
-            recorder = ReplicaRecorder(learner, given, experience, groups, seeds, vary, settings, title, lambda: None, log)
+            parts = learner, given, experience, groups, seeds, vary
+            recorder = ReplicaRecorder(*parts, settings, title, lambda: None, log)
             n_experience = longest(experience)
         else:
             if isinstance(experience, Source):

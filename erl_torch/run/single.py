@@ -45,7 +45,6 @@ from erl_torch.run.report import (
 from erl_torch.solution import Solution, proven
 from erl_torch.solvers import certify, solve_soft_bellman
 
-
 NO_FIGURES: dict[str, float | None] = {"reward_per_step": None, "objective": None, "return": None}
 SAID = ("reward_per_step", "objective")  # at milestones
 
@@ -274,7 +273,7 @@ class SingleRecorder:
             "seed": self.title.seed,
             "status": solution.status.name.lower(),
             "message": solution.message,
-            **results({"theta": solution.theta, "rho": rho, "delta_max": delta_max, **NO_FIGURES, **figures(self.last)}),
+            **results({"theta": solution.theta, "rho": rho, "delta_max": delta_max} | NO_FIGURES | figures(self.last)),
             "theta_bounds": list(solution.theta_bounds) if solution.theta_bounds else None,
             "gap": solution.gap,
             "k": solution.k,

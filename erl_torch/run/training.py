@@ -164,7 +164,8 @@ def _single(
         experience = permitted(experience, problem.prior, learner.drawn_from_prior == "a_next", note)
         safe_point()
     title = Title(cfg.env.name, cfg.learner.name, cfg.seed)
-    recorder = SingleRecorder(learner, problem, experience, settings, streams(cfg.seed).evaluation, title, n_skipped, log)
+    rng = streams(cfg.seed).evaluation
+    recorder = SingleRecorder(learner, problem, experience, settings, rng, title, n_skipped, log)
     return learner, problem, experience, recorder, {"n_experience": 0 if experience is None else len(experience)}
 
 

@@ -33,9 +33,7 @@ class Options(NamedTuple):
     action_labels: Labels | None = None
 
 
-ALLOWED = (
-    "there: a CSV, Parquet, JSON-lines or npz file, a directory of such parts or of columns, or minari:DATASET"
-)
+ALLOWED = "there: a CSV, Parquet, JSON-lines or npz file, a directory of such parts or of columns, or minari:DATASET"
 
 
 class Reader(Protocol):

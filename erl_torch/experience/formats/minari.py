@@ -139,7 +139,7 @@ class Minari:
 class Episodes(InOrder):
     """Episodes of a local Minari data set with Discrete spaces, as a table with a row a step."""
 
-    names = ("s", "a", "r", "s_next", "terminated", "truncated", "episode")
+    names: Sequence[str] = ("s", "a", "r", "s_next", "terminated", "truncated", "episode")
 
     def __init__(self, path: str) -> None:
         self.path = path
@@ -161,7 +161,7 @@ class Episodes(InOrder):
             n = len(batch["s"])
             last = np.arange(n) == n - 1
             flags = {"terminated": last & terminated, "truncated": last & (not terminated)}
-            held.append({**batch, **flags, "episode": np.full(n, number)})
+            held.append({**batch, **flags, "episode": np.full(n, number, np.int64)})
             number += 1
             if sum(len(one["s"]) for one in held) >= rows:
                 yield from _as_cells(held, names, rows)

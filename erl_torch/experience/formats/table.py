@@ -60,9 +60,12 @@ class Table(Protocol):
     """Columns by name, which can be read again and again."""
 
     path: str  # what messages call it
-    names: Sequence[str]  # of its columns, in their order; a name may be there twice
     decimal_comma: bool  # 1,5 is a number
     invalid: int  # rows without the right number of columns, left out; known after a pass
+
+    @property
+    def names(self) -> Sequence[str]:
+        """Of its columns, in their order; a name may be there twice."""
 
     def batches(self, names: Sequence[str], rows: int, strict: bool) -> Iterator[dict[str, Cells]]:
         """Make one pass over some columns, in order, at most ``rows`` rows at a time.
@@ -89,7 +92,7 @@ class InOrder:
 
 
 def kind_of(path: Path) -> str | None:
-    """"csv", "json" or "parquet", by the name of a file, whatever its case; None for another."""
+    """ "csv", "json" or "parquet", by the name of a file, whatever its case; None for another."""
     suffixes = [suffix.lower() for suffix in path.suffixes]
     if suffixes and suffixes[-1] in PACKED:
         suffixes.pop()
