@@ -121,9 +121,7 @@ def train(
     began = time.perf_counter()
     seed = checks.at_least("seed", seed, 0)
     settings = EvaluationSettings() if evaluation is None else evaluation
-    log = problem if isinstance(problem, Log) else None
-    if log is not None and experience is None:
-        experience = log.experience if isinstance(learner, Replicas) else log.recording
+    log, experience = _of_log(learner, problem, experience)
     one = _checked(learner, experience, settings, checkpoint_every)
     many = isinstance(learner, Replicas)
     given = _problem(problem, one.prior_policy, settings.horizon)
@@ -133,9 +131,7 @@ def train(
     described = _described(learner, given, experience, seed, settings) | {"digest": checksum}
     saved = Checkpoints(Path(directory), described, checkpoint_every, getattr(one, "device", "cpu"), "directory")
     if saved.result() is not None:
-        saved.clear()
-        kind, name = (ReplicaSolution, "replicas.npz") if many else (Solution, "solution.npz")
-        return kind.load(saved.directory / name)
+        return _read(saved, many)
     title = Title(given.name, described["learner"]["name"], seed)
     with collected(print_them=talks) as notes:
         recorder: Any
@@ -183,9 +179,28 @@ def train(
             if made and not any(saved.directory.iterdir()):
                 saved.directory.rmdir()
     if not talks:
-        for text in notes:
-            warnings.warn(text, Note, stacklevel=2)
+        _warn(notes)
     return solution
+
+
+def _of_log(learner: Any, problem: Given, experience: Any) -> tuple[Log | None, Any]:
+    """The log, if ``problem`` is one, and the experience: its own, if no other is given."""
+    if not isinstance(problem, Log):
+        return None, experience
+    own = problem.experience if isinstance(learner, Replicas) else problem.recording
+    return problem, own if experience is None else experience
+
+
+def _read(saved: Checkpoints, many: bool) -> Solution | ReplicaSolution:
+    """The solution of a run that is complete."""
+    saved.clear()
+    kind, name = (ReplicaSolution, "replicas.npz") if many else (Solution, "solution.npz")
+    return kind.load(saved.directory / name)
+
+
+def _warn(notes: list[str]) -> None:
+    for text in notes:
+        warnings.warn(text, Note, stacklevel=3)
 
 
 def _checked(

@@ -83,10 +83,11 @@ def stride_of(source: Table, roles: Roles, key: str = "") -> float:
             different, times = np.unique(up, return_counts=True)
             counted.update(dict(zip(different.tolist(), times.tolist(), strict=True)))
         n, lost, last = n + len(step), lost + int(np.isnan(step).sum()), (final, float(step[-1]))
-    stride, times = counted.most_common(1)[0] if counted else (0.0, 0)
-    if stride < 0 and 2 * times > counted.total() and 2 * lost < n:
+    stride, most = counted.most_common(1)[0] if counted else (0.0, 0)
+    usable = 2 * most > counted.total() and 2 * lost < n
+    if stride < 0 and usable:
         raise InputError(f"path={source.path}: {name}", f"steps of {stride:g}", "in order of time: it goes down")
-    usable = stride > 0 and 2 * times > counted.total() and 2 * lost < n
+    usable = usable and stride > 0
     if key and not usable and counted.total():
         raise InputError(key, name, "a counter: it must go up by the same number from row to row of an episode")
     return stride if usable else 0.0

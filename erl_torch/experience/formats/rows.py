@@ -269,8 +269,8 @@ class Rows:
     def _next_actions(self, s_next: np.ndarray, a_next: np.ndarray, x: np.ndarray) -> np.ndarray:
         """a', drawn where it is missing, or lacking in s'."""
         if self._cdf is None or self._prior is None:
-            return np.maximum(a_next, 0)
-        draws = (a_next < 0) | (self._prior[s_next, np.maximum(a_next, 0)] == 0)
+            return np.asarray(np.maximum(a_next, 0))
+        draws = np.asarray(a_next < 0) | (self._prior[s_next, np.maximum(a_next, 0)] == 0)
         if draws.any():
             a_next = a_next.copy()
             a_next[draws] = drawn(self._cdf, s_next[draws], x[draws])
