@@ -22,11 +22,11 @@ from numpy.typing import ArrayLike
 from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.experience.formats import ALLOWED, FORMATS, minari, npy, rows
-from erl_torch.experience.formats.encoding import Encoding, Met, truth
+from erl_torch.experience.formats.encoding import Encoding, Met
 from erl_torch.experience.formats.format import Options
 from erl_torch.experience.formats.order import in_order, stride_of
 from erl_torch.experience.formats.roles import Roles, roles_of
-from erl_torch.experience.formats.rows import Rows, Seen
+from erl_torch.experience.formats.rows import Rows, Seen, terminations
 from erl_torch.experience.formats.table import Cells, InOrder, Table, is_frame, of_frame, of_npz, open_table
 from erl_torch.experience.recording import CHUNK, READ, FileRecording, Recordable
 from erl_torch.experience.transitions import COLUMNS, Transitions
@@ -287,7 +287,7 @@ def _encodings(source: Table, roles: Roles, strict: bool, told: Callable[[int], 
         parts = {role: [found[name] for name in columns] for role, columns in roles.items()}
         everywhere = np.ones(parts["s"][0].n_rows, bool)
         # The state after the end of an episode is none that anything leads to.
-        goes_on = truth(parts["terminated"][0]) != 1 if "terminated" in parts else everywhere
+        goes_on = ~terminations(roles, parts)
         for met, role, where in (
             (states, "s", everywhere),
             (states, "s_next", goes_on),

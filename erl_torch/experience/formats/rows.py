@@ -27,7 +27,7 @@ import numpy as np
 
 from erl_torch.checks import InputError
 from erl_torch.experience.formats import table
-from erl_torch.experience.formats.encoding import UNKNOWN, Encoding, numbers, truth
+from erl_torch.experience.formats.encoding import LOST, UNKNOWN, Encoding, numbers, truth
 from erl_torch.experience.formats.format import Batch, Options
 from erl_torch.experience.formats.order import in_order, stride_of
 from erl_torch.experience.formats.roles import NEEDED, Roles, plain, roles_of
@@ -131,8 +131,6 @@ class Rows:
         self._cdf = None if prior_policy is None else np.cumsum(prior_policy, axis=1)
         self._of_next_row = "s_next" not in roles
         self._looks_on = bool({"episode", "terminated", "truncated"} & roles.keys()) or on_prior
-        # "done" of older environments is true at time limits too.
-        self._done = {"done", "dones"} & set(map(plain, roles.get("terminated", ()))) != set()
         self.seen = Seen()
 
     @property
@@ -177,14 +175,12 @@ class Rows:
             if not n:
                 continue
             wrong = _Wrong(self, np.arange(self.seen.rows, self.seen.rows + n), strict)
-            codes = {role: self._coded(role, parts, n, wrong) for role in ("s", "a", "s_next", "a_next")}
             r = numbers(parts["r"][0], self._source.decimal_comma)
-            wrong.found(
-                "r", ~np.isfinite(r), parts["r"], "finite" if parts["r"][0].codes is None else "a finite number"
-            )
+            finite = "finite" if parts["r"][0].codes is None else "a finite number"
             flags = {role: self._flag(role, parts, n, wrong) for role in ("terminated", "truncated")}
-            if self._done:
-                flags["terminated"] &= ~flags["truncated"]
+            flags["terminated"] &= terminations(self._roles, parts)
+            codes = {role: self._coded(role, parts, flags["terminated"], wrong) for role in self._encodings}
+            wrong.found("r", ~np.isfinite(r), parts["r"], finite)
             begins = np.zeros(n, bool)
             if "episode" in parts:
                 values, episode = parts["episode"][0].factors()
@@ -202,14 +198,18 @@ class Rows:
             yield Block(wrong.row, codes["s"], codes["a"], r, codes["s_next"], codes["a_next"], flags["terminated"],
                         flags["truncated"], begins, step, wrong.raised(), x)  # fmt: skip
 
-    def _coded(self, role: str, parts: Mapping[str, Sequence[Cells]], n: int, wrong: _Wrong) -> np.ndarray:
+    def _coded(
+        self, role: str, parts: Mapping[str, Sequence[Cells]], terminated: np.ndarray, wrong: _Wrong
+    ) -> np.ndarray:
         """[n] numbers of the values of a role; below 0 where there are none."""
         if role not in parts:
-            return np.full(n, -1)
+            return np.full(len(terminated), LOST)
         encoding = self._encodings[role]
         codes = encoding.codes(parts[role])
-        # What may be missing is looked at once it is known whether it is needed.
-        wrong.found(role, codes < 0 if role in NEEDED else codes == UNKNOWN, parts[role], encoding.allowed)
+        # Whether what is missing is needed shows later. What comes after an end is none of the states.
+        wrong.found(
+            role, codes < 0 if role in NEEDED else (codes == UNKNOWN) & ~terminated, parts[role], encoding.allowed
+        )
         return codes
 
     def _flag(self, role: str, parts: Mapping[str, Sequence[Cells]], n: int, wrong: _Wrong) -> np.ndarray:
@@ -315,6 +315,16 @@ def _shown(cells: Cells, i: int) -> Any:
     if cells.codes is None:
         return cells.values[i].item()
     return "missing" if cells.codes[i] < 0 or cells.values[cells.codes[i]] == "" else cells.values[cells.codes[i]]
+
+
+def terminations(roles: Roles, parts: Mapping[str, Sequence[Cells]]) -> np.ndarray:
+    """[n] bool: rows that terminate their episode. ``done`` of older programs is true at time limits too."""
+    if "terminated" not in roles:
+        return np.zeros(parts["s"][0].n_rows, bool)
+    ends = truth(parts["terminated"][0]) == 1
+    if plain(roles["terminated"][0]) in ("done", "dones") and "truncated" in roles:
+        ends &= truth(parts["truncated"][0]) != 1
+    return np.asarray(ends)
 
 
 def drawn(cdf: np.ndarray, s: np.ndarray, x: np.ndarray) -> np.ndarray:

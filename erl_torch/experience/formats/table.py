@@ -192,7 +192,7 @@ class CsvFile(InOrder):
             if b"," not in line and self._delimiter == ",":
                 self._delimiter = next((mark for mark in ";\t" if mark.encode() in line), ",")
             self.decimal_comma = self._delimiter == ";"
-            with self._open() as stream, self._reader(stream, None, True) as reader:
+            with self._open() as stream, self._reader(stream, None, False) as reader:
                 self._raw = list(reader.schema.names)
         self.names = [name.strip() for name in self._raw]
 
