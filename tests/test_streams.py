@@ -450,7 +450,7 @@ def test_command_line(tmp_path, typed_here):
     simulated = [*options, "experience.n_episodes=20", "experience.episode_length=100"]
     code, _, error = typed_here("train.py", *simulated, "experience.save_to=t/", "hydra.run.dir=a")
     assert code == 0, error
-    recorded = [*options, "experience=recorded", "experience.path=t"]
+    recorded = [*options, "env=windy_cliff", "experience=recorded", "experience.path=t"]
     code, _, error = typed_here("train.py", *recorded, "experience.chunk=100", "hydra.run.dir=b")
     assert code == 0, error
     results = [json.loads((tmp_path / name / "result.json").read_text()) for name in "ab"]

@@ -117,7 +117,8 @@ class LogReport:
         if self.gaps is None:
             lines.append(("gaps", "cannot be seen: there is neither a state after nor a step"))
         else:
-            lines.append(("gaps", f"{_n(self.gaps, 'row')} that do not go on where the row before led to"))
+            do = "does" if self.gaps == 1 else "do"
+            lines.append(("gaps", f"{_n(self.gaps, 'row')} that {do} not go on where the row before led to"))
         lines += [("not answered" if i == 0 else "", text) for i, text in enumerate(self.not_answered)]
         return "\n".join(f"{name:18}{text}" for name, text in lines)
 

@@ -103,7 +103,7 @@ def kind_of(path: Path) -> str | None:
 def claims(path: str) -> bool:
     place = Path(path)
     if place.is_dir():
-        return any([kind_of(part) for part in place.iterdir()])
+        return any(list(map(kind_of, place.iterdir())))
     return place.is_file() and kind_of(place) is not None
 
 
