@@ -6,6 +6,7 @@ labels; where all are numbers, the labels are these numbers as text; else all ar
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -203,6 +204,11 @@ def numbers(cells: Cells, decimal_comma: bool) -> np.ndarray:
     if cells.codes is None:
         with np.errstate(over="ignore"):
             return np.asarray(cells.values, np.float64)
+
+    # All at once, if all are numbers.
+    if not decimal_comma and not any("_" in value for value in cells.values if isinstance(value, str)):
+        with contextlib.suppress(TypeError, ValueError, OverflowError):
+            return np.append(np.array(cells.values, np.float64), np.nan)[cells.codes]
 
     def number(value: Any) -> float:
         if isinstance(value, str):

@@ -40,8 +40,9 @@ def in_order(source: Table, roles: Roles) -> Table:
         place = place[np.maximum.accumulate(np.where(place >= 0, np.arange(len(place)), 0))]
         apart = apart or bool((np.diff(place) < 0).any())
         last, n = int(place[-1]), n + len(codes)
-        order.append(place[1:].astype(np.int32))
-        if apart and n > MOST_SORTED:
+        if n <= MOST_SORTED:
+            order.append(place[1:].astype(np.int32))
+        elif apart:
             allowed = f"sorted, all rows of an episode together: more than {MOST_SORTED:,} rows are not sorted here"
             raise InputError(f"path={source.path}: {name}", "episodes that come back", allowed)
     if not apart:
