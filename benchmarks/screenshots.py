@@ -34,7 +34,8 @@ FLAGS = (
 )  # fmt: skip
 # Name of the picture -> runs to show, what follows the address, and the window.
 SHOTS = {
-    "custom-scalars": ("one", "#custom_scalars&_smoothingWeight=0", 1300, 2100),
+    "custom-scalars": ("one/windy_cliff", "#custom_scalars&_smoothingWeight=0", 1300, 1800),
+    "text": ("one/windy_cliff", "#text", 1300, 800),
     "images": ("one", "#images", 1300, 1300),
     "scalars": ("sweep", "#scalars&_smoothingWeight=0&tagFilter=%5Eeval%7Clearner/theta%24", 1300, 1000),
     "hparams": ("sweep", "#hparams", 2350, 620),

@@ -7,7 +7,10 @@ import itself stays light. Their types are in ``__init__.pyi``.
 from __future__ import annotations
 
 import erl_torch.envs  # noqa: F401  (registers the environments)
+from erl_torch.compiled import find_room
 from erl_torch.lazy import Renamed, loader
+
+find_room()  # before any module with loops
 
 __version__ = "0.1.0"
 
@@ -30,6 +33,7 @@ _PUBLIC = {
     "learners.learner": "Learner NonFiniteError State StreamLearner",
     "learners.replicas": "Replicas ReplicaSolution",
     "learners.s1.algorithm": "AlgorithmS1 ListedS1 S1State",
+    "labels": "Labels",
     "mdp.from_gymnasium": "MeanRewardWarning tabular_mdp",
     "mdp.masks": "ActionMasks",
     "mdp.tabular": "TabularMDP",
@@ -39,6 +43,11 @@ _PUBLIC = {
     "run.session": "train",
     "solution": "Solution Status",
     "solvers": "certify iterate_biasing perron solve_biasing solve_soft_bellman",
+    "solvers.discounted": "solve_discounted",
+    "solvers.episodes": "EpisodeFigures evaluate_episodes",
+    "solvers.finite_horizon": "solve_finite_horizon",
+    "solvers.first_exit": "ExitSolution solve_first_exit",
+    "solvers.values": "ValueSolution",
 }
 _HOME = {name: module for module, names in _PUBLIC.items() for name in names.split()}
 

@@ -23,6 +23,7 @@ from erl_torch.experience.rollouts import rollout as rollout
 from erl_torch.experience.simulation import Simulation as Simulation
 from erl_torch.experience.sources import Source as Source
 from erl_torch.experience.transitions import Transitions as Transitions
+from erl_torch.labels import Labels as Labels
 from erl_torch.learners.certainty_equivalence import CertaintyEquivalence as CertaintyEquivalence
 from erl_torch.learners.efficient_s1.algorithm import EfficientS1 as EfficientS1
 from erl_torch.learners.learner import Learner as Learner
@@ -49,6 +50,13 @@ from erl_torch.solvers import iterate_biasing as iterate_biasing
 from erl_torch.solvers import perron as perron
 from erl_torch.solvers import solve_biasing as solve_biasing
 from erl_torch.solvers import solve_soft_bellman as solve_soft_bellman
+from erl_torch.solvers.discounted import solve_discounted as solve_discounted
+from erl_torch.solvers.episodes import EpisodeFigures as EpisodeFigures
+from erl_torch.solvers.episodes import evaluate_episodes as evaluate_episodes
+from erl_torch.solvers.finite_horizon import solve_finite_horizon as solve_finite_horizon
+from erl_torch.solvers.first_exit import ExitSolution as ExitSolution
+from erl_torch.solvers.first_exit import solve_first_exit as solve_first_exit
+from erl_torch.solvers.values import ValueSolution as ValueSolution
 
 __version__: str
 __all__: list[str]

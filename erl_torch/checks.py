@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
 
+from erl_torch.guesses import did_you_mean
+
 if TYPE_CHECKING:
     import scipy.sparse as sp
     import torch
@@ -237,7 +239,7 @@ def _text(value: object) -> str:
 def one_of(key: str, value: object, allowed: tuple[str, ...]) -> None:
     """Raise InputError unless ``value`` is one of ``allowed``."""
     if not isinstance(value, str) or value not in allowed:
-        raise InputError(key, value, " or ".join(allowed))
+        raise InputError(key, value, " or ".join(allowed) + did_you_mean(value, allowed))
 
 
 def flag(key: str, value: object) -> bool:

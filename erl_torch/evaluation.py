@@ -12,10 +12,12 @@ from numpy.typing import ArrayLike
 
 from erl_torch import checks
 from erl_torch.checks import InputError
+from erl_torch.envs.encoded import encoded
 from erl_torch.experience import kernels as experience_kernels
 from erl_torch.experience.collect import batched
 from erl_torch.experience.play import Draws, Plan, episode, reset
 from erl_torch.experience.sampling import policy_cdf, sampling_tables
+from erl_torch.mdp.ends import EndRule
 from erl_torch.mdp.from_gymnasium import ending_states, known_mdp, sizes
 from erl_torch.mdp.tabular import TabularMDP, check_policy, check_prior
 from erl_torch.rng import Streams
@@ -31,6 +33,7 @@ class Evaluation(NamedTuple):
     mean_return: float  # undiscounted return of an episode, mean over sampled episodes
     reward_per_step: float  # exact over the horizon where the model is known, else sampled
     objective: float  # stationary reward rate - KL/beta, as ``objective``, where the model is known; else sampled
+    success_rate: float = np.nan  # of episodes within the horizon; NaN where it is not known what a success is
 
 
 def evaluate(
@@ -43,6 +46,8 @@ def evaluate(
     prior_policy: ArrayLike | None = None,
     mdp: TabularMDP | None = None,
     mean_return: Callable[[np.ndarray], float] | None = None,
+    success_rate: Callable[[np.ndarray], float] | None = None,
+    ends: EndRule | None = None,
 ) -> Evaluation:
     """Evaluate ``policy`` [S, A]: on the model where it is known, by playing episodes otherwise.
 
@@ -59,6 +64,9 @@ def evaluate(
         prior_policy: [S, A], 0 where an action is not to be taken; None is uniform over the actions of each state.
         mdp: the model behind reward per step and objective; None is ``known_mdp(source)``.
         mean_return: computes the mean return of a policy [S, A]; no episodes are played then.
+        success_rate: computes the success rate of a policy [S, A]; None counts episodes played.
+        ends: which ends of episodes played are failures. What it adds to their rewards counts in reward per step and
+            objective, not in the return. None: it is not known.
 
     Raises:
         InputError: an argument out of range, a policy or prior that is not [S, A], or a model of other sizes.
@@ -67,6 +75,7 @@ def evaluate(
     n_episodes, horizon = checks.at_least("n_episodes", n_episodes, 1), checks.at_least("horizon", horizon, 1)
     checks.memory("n_episodes", n_episodes, 8 * n_episodes, "the returns of all episodes")
     checks.instance("rng", rng, np.random.Generator, "a generator, as numpy.random.default_rng(0)")
+    source = encoded(source)
     n_states, n_actions = sizes(source)
     if mdp is not None:
         checks.instance("mdp", mdp, TabularMDP, "a TabularMDP")
@@ -77,6 +86,7 @@ def evaluate(
     allowed = None if model is None else model.allowed
     table = check_policy("policy", policy, n_states, n_actions, allowed)
     prior = check_prior("prior_policy", prior_policy, n_states, n_actions, allowed)
+    succeeded = np.nan
     endless = isinstance(source, TabularMDP) or not ending_states(source, n_states).any()
     if model is not None and mean_return is not None:
         played = mean_return(table)
@@ -86,11 +96,14 @@ def evaluate(
         played = float(returns.mean())
     else:
         assert not isinstance(source, TabularMDP)
-        sampled = _evaluate_by_playing(source, table, prior, beta, rng, n_episodes, horizon)
-        played = sampled.mean_return
+        sampled = _evaluate_by_playing(source, table, prior, beta, rng, n_episodes, horizon, ends)
+        played, succeeded = sampled.mean_return, sampled.success_rate
     if model is None:
         return sampled
-    return Evaluation(played, reward_per_step(model, table, horizon), objective(model, table, prior, beta))
+    if success_rate is not None:
+        succeeded = success_rate(table)
+    figures = reward_per_step(model, table, horizon), objective(model, table, prior, beta)
+    return Evaluation(played, *figures, succeeded)
 
 
 class Judge:
@@ -154,6 +167,7 @@ def _evaluate_by_playing(
     rng: np.random.Generator,
     n_episodes: int,
     horizon: int,
+    ends: EndRule | None,
 ) -> Evaluation:
     kl = kl_per_state(policy, prior)
     batch = batched(env)
@@ -162,11 +176,17 @@ def _evaluate_by_playing(
         data = batch(Plan(n_episodes, horizon, Streams(rng, rng, rng), policy, uniform, False), "original")
         return Evaluation(data.r.sum() / n_episodes, data.r.mean(), float((data.r - kl[data.s] / beta).mean()))
     choose = Draws(policy, rng)
-    total = total_kl = 0.0
-    n_steps = 0
+    total = total_kl = charged = 0.0
+    n_steps = n_successes = 0
     for _ in range(n_episodes):
         for step in episode(env, reset(env, rng), choose, horizon):
             total += step.r
             total_kl += kl[step.s]
             n_steps += 1
-    return Evaluation(total / n_episodes, total / n_steps, float(total - total_kl / beta) / n_steps)
+            if step.terminated and ends is not None:
+                failed, more = ends.of(step.r, step.s_next)
+                charged += more
+                n_successes += not failed
+    succeeded = np.nan if ends is None else n_successes / n_episodes
+    paid = total + charged
+    return Evaluation(total / n_episodes, paid / n_steps, float(paid - total_kl / beta) / n_steps, succeeded)

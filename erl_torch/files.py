@@ -37,6 +37,13 @@ def _write(path: str | os.PathLike[str], fill: Callable[[BinaryIO], None]) -> Pa
     return path
 
 
+def here(path: Path) -> Path:
+    """A path as a user would write it: below the working directory, or in full."""
+    with contextlib.suppress(ValueError):
+        return path.resolve().relative_to(Path.cwd())
+    return path
+
+
 def write_npz(path: str | os.PathLike[str], arrays: Mapping[str, Any]) -> Path:
     """Write a compressed npz; the same arrays give the same bytes. Object arrays are refused."""
 

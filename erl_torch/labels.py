@@ -12,7 +12,7 @@ import difflib
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cached_property
-from typing import Any, Protocol, TypeGuard
+from typing import Any, NamedTuple, Protocol, TypeGuard
 
 import gymnasium as gym
 import numpy as np
@@ -25,6 +25,22 @@ Label = Any  # int | str | tuple[Label, ...] | dict[str, Label]: mypy has no rec
 
 ALLOWED = "a whole number, a text, or a tuple or dict of such"
 MOST = 2**31 - 1  # states or actions: tuples hold them in 32 bits
+
+
+class Names(NamedTuple):
+    """What texts for people call states and actions."""
+
+    states: Labels | None = None  # None: their numbers
+    actions: Labels | None = None
+
+    def state(self, s: int, symbol: str = "s") -> str:
+        return f"{symbol}={s if self.states is None else self.states.text(int(s))}"
+
+    def pair(self, s: int, a: int) -> str:
+        return f"{self.state(s)}, a={a if self.actions is None else self.actions.text(int(a))}"
+
+
+NUMBERS = Names()
 
 
 class Labels:
@@ -57,7 +73,7 @@ class Labels:
     def of_space(space: gym.Space[Any]) -> SpaceLabels:
         """The members of a finite space: Discrete, MultiDiscrete, MultiBinary, a Box of bounded whole numbers, and
         Tuple and Dict of such. In the order of their entries: the last one counts fastest. A Dict's entries are in
-        the order of ``space.keys()``.
+        the order of their names.
 
         Raises:
             InputError: a space that is not finite, or one with 2**31 members or more.
@@ -350,7 +366,7 @@ class _Product:
 
     def decode(self, number: int) -> Label:
         items = [part.decode(i) for part, i in zip(self.parts, self._numbers(number), strict=True)]
-        return tuple(items) if self.names is None else dict(sorted(zip(self.names, items, strict=True)))
+        return tuple(items) if self.names is None else dict(zip(self.names, items, strict=True))
 
     def member(self, number: int) -> Any:
         items = [part.member(i) for part, i in zip(self.parts, self._numbers(number), strict=True)]
@@ -380,6 +396,7 @@ def _part(space: gym.Space[Any]) -> _Part:
     if isinstance(space, spaces.Tuple):
         return _Product([_part(part) for part in space.spaces], None)
     if isinstance(space, spaces.Dict):
-        return _Product([_part(part) for part in space.spaces.values()], list(space.spaces))
+        names = sorted(space.spaces)  # files and Gymnasium order them in several ways
+        return _Product([_part(space.spaces[name]) for name in names], names)
     allowed = "a finite space: Discrete, MultiDiscrete, MultiBinary, a Box of whole numbers, or Tuple and Dict of such"
     raise InputError("space", space, allowed)

@@ -12,24 +12,49 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
+from erl_torch.labels import NUMBERS, Names
+
 DPI = 100
 MAX_PX = 400  # TensorBoard's image cards are about this wide
 # Those of Okabe and Ito, which any colour vision tells apart, and three more.
 COLOURS = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#222222", "#7b3294", "#8c6d31", "#9a9a9a"]
 MARKERS = "os^"
+MOST_ROWS, MOST_COLUMNS = 30, 12  # of a table whose rows or columns are named
 
 
-def table_picture(table: np.ndarray, title: str, label: str, max_px: int = MAX_PX) -> np.ndarray:
-    """Any [S, A] table as shades: one row per state, one column per action."""
+def table_picture(
+    table: np.ndarray, title: str, label: str, max_px: int = MAX_PX, names: Names = NUMBERS
+) -> np.ndarray:
+    """Any [S, A] table as shades: one row per state, one column per action.
+
+    Of at most 30 states, or 12 actions, the labels stand beside the rows, or below the columns.
+    """
     figure = Figure(figsize=(max_px / DPI, max_px / DPI), dpi=DPI)
-    axes = figure.add_axes((0.13, 0.12, 0.65, 0.8))
+    states, actions = names
+    rows = [] if states is None or len(states) > MOST_ROWS else [_brief(x) for x in states.texts.tolist()]
+    columns = [] if actions is None or len(actions) > MOST_COLUMNS else [_brief(x) for x in actions.texts.tolist()]
+    # 7 points of type are about 5 pixels a letter.
+    left = 0.13 + 5 / max_px * max(map(len, rows), default=0)
+    slanted = sum(map(len, columns)) * 6 > (0.78 - left) * max_px
+    bottom = 0.12 + (5 / max_px * max(map(len, columns)) if slanted else 0)
+    axes = figure.add_axes((left, bottom, 0.78 - left, 0.92 - bottom))
     image = axes.imshow(table, aspect="auto", interpolation="nearest", cmap="viridis")
     axes.set_xlabel("action a")
     axes.set_ylabel("state s")
-    axes.set_xticks(range(table.shape[1]) if table.shape[1] <= 12 else [])
+    axes.set_xticks(range(table.shape[1]) if table.shape[1] <= MOST_COLUMNS else [])
+    if columns:
+        axes.set_xticks(range(len(columns)), columns, fontsize=7, rotation=90 if slanted else 0)
+    if rows:
+        axes.set_yticks(range(len(rows)), rows, fontsize=7)
     axes.set_title(title, fontsize=9)
     colour_bar(figure, image, label)
     return pixels(figure)
+
+
+def _brief(label: str) -> str:
+    """A label on one line, at most 24 letters long, that matplotlib takes for no formula."""
+    line = " ".join(label.split())
+    return (line if len(line) <= 24 else f"{line[:23]}\u2026").replace("$", r"\$")
 
 
 def learning_curves(sizes: Sequence[int], curves: Mapping[str, Sequence[Mapping[str, Any]]], title: str) -> np.ndarray:
@@ -82,7 +107,9 @@ def bands(
     ``card``: draw it small enough for a card of TensorBoard's; use it with one panel.
     """
     exact: dict[str, Any] = {"linestyle": "", "marker": "x", "markersize": 5} if markers else {"linestyle": "--"}
-    caption = f"mean; shaded: quartiles; thin: extremes; {'crosses' if markers else 'dashed'}: exact"
+    known = any(y is not None for lines in panels.values() for line in lines for y in line.exact)
+    caption = "mean; shaded: quartiles; thin: extremes"
+    caption += f"; {'crosses' if markers else 'dashed'}: exact" if known else ""
     figure, all_axes = _panels(len(panels), title, caption, card)
     for axes, (label, lines) in zip(all_axes, panels.items(), strict=True):
         for i, line in enumerate(lines):

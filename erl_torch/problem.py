@@ -9,7 +9,8 @@ import gymnasium as gym
 import numpy as np
 import torch
 
-from erl_torch.labels import Labels
+from erl_torch.labels import Labels, Names
+from erl_torch.mdp.ends import EndRule
 from erl_torch.mdp.masks import ActionMasks
 from erl_torch.mdp.tabular import TabularMDP
 
@@ -30,7 +31,10 @@ class Problem:
         horizon: steps of an episode at most, >= 1.
         name: what messages and pictures call it.
         masks: where the actions of each state are noted, as ``env`` tells them; None where it does not.
-        state_labels, action_labels: of the numbers of states and actions; None: they have no other names.
+        state_labels, action_labels: what states and actions are called; None: their numbers.
+        success: [S, A], the probability that a step of the episode's model ends it in success; None where not known.
+        ends: which ends are failures, and what is added to their rewards where ``env`` is learnt from; None where
+            episodes do not end, or that is not known.
     """
 
     env: gym.Env[Any, Any] | None
@@ -43,6 +47,8 @@ class Problem:
     masks: ActionMasks | None = None
     state_labels: Labels | None = None
     action_labels: Labels | None = None
+    success: np.ndarray | None = None
+    ends: EndRule | None = None
 
     @property
     def allowed(self) -> np.ndarray:
@@ -61,3 +67,7 @@ class Problem:
     @property
     def n_actions(self) -> int:
         return int(self.prior.shape[1])
+
+    @property
+    def names(self) -> Names:
+        return Names(self.state_labels, self.action_labels)

@@ -17,8 +17,10 @@ import torch
 from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.files import read_npz, write_npz
+from erl_torch.labels import Labels
 from erl_torch.mdp.tabular import check_policy
 
+LABELS = "state_labels", "action_labels"
 NO_NAN: checks.Entries = (lambda x: ~np.isnan(x), "a number")
 
 
@@ -33,6 +35,7 @@ class Status(enum.Enum):
         "Raise tol or lower beta"
     )
     REDUCIBLE = "the states that the start leads to are not one recurrent class; the message names them"
+    ILL_POSED = "a way round that never ends pays at least as much as ending; the message names it"
     STOPPED = "stopped by the caller before the last pass; the tables are those of the last full epoch"
     PSI_LIMIT = "the psi phase met max_psi_epochs before psi_tol: raise max_psi_epochs or lr_psi"
     UNCERTIFIED = "the certificate is wider than asked for, as the message says; the bound holds as it stands"
@@ -78,6 +81,8 @@ class Solution:
     theta_bounds: tuple[float, float] | None = None  # two-sided, on theta*; where the model is known
     gap: float | None = None  # at least -theta* - J(policy), reward per step; where the model is known
     k: int | None = None  # biasing iterations as the paper's Table S1 counts them
+    state_labels: Labels | None = None  # what the states and actions are called; None: their numbers
+    action_labels: Labels | None = None
 
     @property
     def log_u(self) -> torch.Tensor:
@@ -151,6 +156,8 @@ class Solution:
                 values |= {f"history/{name}": curve for name, curve in value.items()} if history else {}
             elif isinstance(value, torch.Tensor):
                 values[item.name] = value.detach().cpu().numpy()
+            elif isinstance(value, Labels):
+                values[item.name] = value.texts
             elif value is not None:
                 values[item.name] = value.name if isinstance(value, Status) else value
         return {name: np.asarray(value) for name, value in values.items()}
@@ -181,6 +188,9 @@ class Solution:
                 if isinstance(table, torch.Tensor) and table.shape != sizes[: table.ndim]:
                     allowed = f"of shape {list(sizes[: table.ndim])}, to go with the policy"
                     raise InputError(name, f"array of shape {tuple(table.shape)}", allowed)
+            for name, n in zip(LABELS, sizes, strict=True):
+                if values.get(name) is not None and len(values[name]) != n:
+                    raise InputError(name, f"{len(values[name])} labels", f"{n} labels, to go with the policy")
         except InputError as error:
             raise error.of_file(path) from error
         return cls(**values)
@@ -219,6 +229,11 @@ def _readers() -> dict[str, Callable[[str, np.ndarray], Any]]:
             raise InputError(name, (low, high), "in order")
         return low, high
 
+    def labels(name: str, array: np.ndarray) -> Labels:
+        if array.ndim != 1 or array.dtype.kind != "U":
+            raise InputError(name, f"array of shape {array.shape} and dtype {array.dtype}", "a column of texts")
+        return Labels.of_texts(array.tolist())
+
     pair, state = table("n_states", "n_actions"), table("n_states")
     finite = number(math.isfinite, "a finite number")
     not_negative = number(lambda x: x >= 0, "a number >= 0")
@@ -227,6 +242,7 @@ def _readers() -> dict[str, Callable[[str, np.ndarray], Any]]:
         "rho": not_negative, "theta": finite, "reward_bias_max": not_negative, "gap": not_negative,
         "beta": number(lambda x: 0 < x < math.inf, "a finite number > 0"), "n_steps": count, "k": count,
         "status": status, "message": message, "theta_bounds": bounds,
+        "state_labels": labels, "action_labels": labels,
     }  # fmt: skip
 
 

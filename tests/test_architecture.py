@@ -12,8 +12,8 @@ from helpers import ended
 ROOT = Path(__file__).parents[1] / "erl_torch"
 # From the ground up; a folder may import from those on lines above its own.
 FLOORS = (
-    {"lazy", "checks", "configurations", "notes", "output", "rng", "files", "parallel", "pictures", "log"},
-    {"labels"},
+    {"compiled", "guesses", "lazy"},
+    {"checks", "configurations", "labels", "notes", "output", "rng", "files", "parallel", "pictures", "log"},
     {"solution", "mdp", "problem"},
     {"envs", "solvers"},
     {"experience"},
@@ -25,6 +25,8 @@ FLOORS = (
 )
 BESIDE = {
     ("files", "checks"),
+    ("labels", "checks"),
+    ("pictures", "labels"),
     ("rng", "checks"),
     ("log", "checks"),
     ("solution", "mdp"),

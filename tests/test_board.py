@@ -4,7 +4,6 @@ import json
 import re
 import sys
 import urllib.request
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,7 +16,7 @@ from erl_torch import InputError, NonFiniteError, collect, solve_soft_bellman
 from erl_torch.envs.windy_cliff import WindyCliffEnv
 from erl_torch.log import tensorboard as board
 from erl_torch.log.quantities import BIAS, CONVERGENCE, QUANTITIES, RETURNS, Quantity, with_own
-from erl_torch.run.report import where
+from erl_torch.run.origin import shown
 from erl_torch.run.training import train
 from erl_torch.solvers import certify
 
@@ -75,6 +74,37 @@ def test_lines_stand_beside_every_record(runs, name):
             assert (event.step, event.value) == (steps[-1], pytest.approx(kinds[name][final], rel=1e-6, abs=1e-12))
 
 
+def test_constants_are_runs_of_their_own(runs):
+    """A chart has one colour and one name per run: those below a run's directory hold, under the tags of what is
+    learnt, what it is held against."""
+    reader = events(runs[0] / "efficient")
+    steps = {e.step for e in reader.Scalars("learner/theta")}
+    expected = {
+        ("optimum", "learner/theta"): 1.0101363366,
+        ("optimum", "eval/objective"): -1.0101363366,
+        ("prior", "eval/reward_per_step"): -1.6263453,
+        ("data_95_low", "learner/theta"): reader.Scalars("data/theta_lower")[0].value,
+        ("data_95_high", "learner/theta"): reader.Scalars("data/theta_upper")[0].value,
+    }
+    for (run, tag), value in expected.items():
+        found = events(runs[0] / "efficient" / run).Scalars(tag)
+        assert {e.step for e in found} == steps
+        assert [e.value for e in found] == pytest.approx([value] * len(found), rel=1e-6)
+    assert {path.name for path in (runs[0] / "efficient").iterdir() if path.is_dir()} == {run for run, _ in expected}
+
+
+def test_jobs_of_a_sweep_have_no_runs_below_theirs(tmp_path):
+    (tmp_path / "sweep.json").write_text("{}")
+    train(composed(*SMALL, "learner=s1_efficient", "evaluation.pictures=false"), tmp_path / "0")
+    assert not [path for path in (tmp_path / "0").iterdir() if path.is_dir()]
+    tags = set(events(tmp_path / "0").Tags()["scalars"])
+    layout = layout_pb2.Layout.FromString(events(tmp_path / "0").Tensors("custom_scalars__config__")[0]
+                                          .tensor_proto.string_val[0])  # fmt: skip
+    lines = [tag for one in layout.category for chart in one.chart for tag in chart.multiline.tag]
+    assert "optimal/theta$" in lines
+    assert "optimal/theta" in tags
+
+
 def test_lines_of_the_exact_learner(runs):
     reader = events(runs[0] / "exact")
     last = reader.Scalars("eval/objective")[-1]
@@ -103,6 +133,9 @@ def test_charts_are_those_that_have_data():
         ("data/theta", "data/theta_lower", "data/theta_upper"),
     ]
     assert len(board.layout(["learner/theta"], [])[CONVERGENCE]) == 1  # no band is known
+    alone = board.layout(["learner/theta", "eval/objective"], known, alone=True)
+    assert alone[CONVERGENCE] == {"theta": [r"(learner|s1|exact)/theta$"]}
+    assert alone[RETURNS] == {"objective": ["eval/objective$"]}
 
 
 def test_bands_have_their_lower_end_below():
@@ -122,11 +155,6 @@ def test_bands_have_their_lower_end_below():
         ("all/theta_mean", "all/theta_q25", "all/theta_q75"),
         ("all/theta_median", "all/theta_min", "all/theta_max"),
     }
-
-
-def test_jobs_of_a_sweep_are_shown_side_by_side():
-    assert where(Path("runs/windy_cliff/sweep-1/000-seed=0"))[1] == Path("runs/windy_cliff/sweep-1")
-    assert where(Path("runs/windy_cliff/1"))[1] == "runs"
 
 
 def test_charts_show_runs_of_before_too():
@@ -199,6 +227,24 @@ def test_hyperparameters_are_numbers_and_text():
     assert board.hyperparameters(settings("env=windy_frozen_lake", "env.desc=[SFG]"))["env.desc"] == '["SFG"]'
     assert found["env.on_end"] == "restart"
     assert not {"lr_rho", "env.suggest", "env.id", "name"} & set(found)  # lr_rho: null
+
+
+def test_only_settings_that_tell_runs_apart_are_shown(tmp_path):
+    """Of a run those that were typed, of a job those that its sweep varies."""
+    run = tmp_path / "sweep" / "1"
+    (run / ".hydra").mkdir(parents=True)
+    typed = ["env=windy_cliff", "learner.beta=5", "+env.size=3", "evaluation.every=2"]
+    (run / ".hydra" / "overrides.yaml").write_text("".join(f"- {one}\n" for one in typed))
+    cfg = settings("learner.beta=5", "evaluation.every=2")
+    found = board.hyperparameters(cfg, shown(run), n_experience=7)
+    always = {"env": "windy_cliff", "learner": "s1", "beta": 5, "seed": 0, "n_experience": 7}
+    assert found == always | {"evaluation.every": 2}
+    jobs = [{"overrides": ["learner.beta=2", *typed[2:]]}, {"overrides": typed[1:]}]
+    (tmp_path / "sweep" / "sweep.json").write_text(json.dumps({"jobs": jobs}))
+    typed = typed[1:]
+    (run / ".hydra" / "overrides.yaml").write_text("".join(f"- {one}\n" for one in typed))
+    assert board.hyperparameters(cfg, shown(run), n_experience=7) == {"beta": 5}
+    assert shown(tmp_path) is None  # nothing is noted: a run from Python
 
 
 def test_texts(runs):

@@ -165,10 +165,10 @@ def test_checkpoints_know_their_settings(tmp_path, cut):
 
 def test_checkpoints_of_another_version_stay(cut, monkeypatch):
     cfg, directory, _ = cut
-    monkeypatch.setattr("erl_torch.run.checkpoint.FORMAT", 4)
+    monkeypatch.setattr("erl_torch.run.checkpoint.FORMAT", 5)
     before = files(directory)
     with pytest.raises(
-        InputError, match=r"checkpoint=.*12000.ckpt: must be of this version \(it is of format 3, not 4"
+        InputError, match=r"checkpoint=.*12000.ckpt: must be of this version \(it is of format 4, not 5"
     ):
         train(cfg, directory)
     assert files(directory) == before

@@ -240,7 +240,7 @@ def test_unknown_keys_get_one_line(tmp_path, group, plus):
 @pytest.mark.parametrize(
     ("overrides", "expected"),
     [
-        (["env=cliff"], "env=cliff: must be acrobot or cart_pole or cliff_walking or dynamics_shift or"),
+        (["env=cliff"], "env=cliff: must be access_control or acrobot or admission or car_rental or cart_pole or"),
         (["env=gym"], "env.id=???: must be given, as in env.id=VALUE"),
         (["experience=recorded"], "experience.path=???: must be given, as in experience.path=VALUE"),
         (["learner.beta="], "learner.beta="),

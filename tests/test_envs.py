@@ -7,6 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import scipy.sparse as sp
+from gymnasium.envs.registration import load_env_creator
 from gymnasium.utils.env_checker import check_env
 from helpers import DATA, random_mdp
 from scipy import stats
@@ -24,7 +25,11 @@ from erl_torch.solvers.policy import reward_per_step
 
 IDS = sorted(ENTRY_POINTS)
 MODELS = [env_id for env_id in IDS if env_id not in CONTROL_ENTRY_POINTS]  # the others: test_control.py
-GRIDS = [env_id for env_id in MODELS if env_id != "erl_torch/TabularMDP-v0"]
+GRIDS = [
+    env_id
+    for env_id in MODELS
+    if "rgb_array" in load_env_creator(gym.spec(env_id).entry_point).metadata["render_modes"]
+]
 
 
 @pytest.fixture(scope="module")

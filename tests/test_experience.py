@@ -149,7 +149,7 @@ def test_bad_arguments(arguments, message):
 
 
 def test_continuous_spaces_are_refused():
-    with pytest.raises(InputError, match=r"observation_space=.*must be Discrete"):
+    with pytest.raises(InputError, match=r"observation_space=.*must be a finite space: Discrete"):
         erl_torch.collect(gym.make("CartPole-v1"), 1, 10)
 
 

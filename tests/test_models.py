@@ -118,12 +118,12 @@ def test_repeated_entries_are_summed():
     [
         (lambda: gym.make("Taxi-v4", fickle_passenger=True), "fickle_passenger=True: must be False"),
         (lambda: gym.make("CartPole-v1"), "observation_space=Box"),
-        (lambda: gym.make("Blackjack-v1"), "observation_space=Tuple"),
+        (lambda: gym.make("Blackjack-v1"), "one that has its model as P"),
         (lambda: gym.wrappers.TransformReward(gym.make("Taxi-v4"), float), "without TransformReward"),
-        (lambda: Table({0: {0: [(1.0, 0, 0.0, False)]}}), "P=dict: must be P"),
+        (lambda: Table([{0: [(1.0, 0, 0.0, False)]}]), "P=1 items: must be a dict, or a list of 2"),
         (
             lambda: Table({0: {0: [(1.0, 2, 0.0, False)]}, 1: {0: [(1.0, 0, 0.0, False)]}}, [1, 0]),
-            r"states in \[0, 2\)",
+            r"P\[0\]\[0\]: s'=2: must be in Discrete\(2\)",
         ),
         (lambda: Table({0: {0: [(0.9, 1, 0.0, False)]}, 1: {0: [(1.0, 0, 0.0, False)]}}, [1, 0]), "transition row 0"),
         (lambda: Table({0: {0: [(1.0, 1, 0.0, False)]}, 1: {0: [(1.0, 0, 0.0, False)]}}), "start=None: must be given"),

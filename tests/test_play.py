@@ -132,7 +132,7 @@ def test_environments(cliff, tmp_path, capsys, env, n_states, n_actions, render)
     run = copy(cliff, tmp_path / "run", np.full((n_states, n_actions), 1 / n_actions), f"env={env}")
     played = play(arguments(f"run={run}", "n_episodes=1", f"render={render}", "n_steps=2"))
     if env == "mountain_car":
-        assert "mountain_car has no text to show; render=gif draws it" in capsys.readouterr().out
+        assert "mountain_car has no text of its own to show; render=gif draws it" in capsys.readouterr().out
     elif render != "none":
         assert len(played.shown) == 3
     assert len(list(run.glob("*.gif"))) == (render == "gif")
@@ -211,8 +211,8 @@ def test_modules_are_imported_only_if_named_again(cliff, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     policy = Solution.load(cliff / "solution.npz").policy
     run = copy(cliff, tmp_path / "run", policy, "env=gym", "env.id='mine:Mine-v0'", "env.name=mine")
-    for module in ("null", "other"):
-        with pytest.raises(InputError, match=r"module=.*: must be typed as module=mine: it makes"):
+    for module, said in (("null", r"run=.*: must be played with .*: add module=mine$"), ("other", "must be mine$")):
+        with pytest.raises(InputError, match=said):
             play(arguments(f"run={run}", f"module={module}", "n_episodes=1"))
     assert "mine" not in sys.modules
     assert len(play(arguments(f"run={run}", "module=mine", "n_episodes=1", "render=none")).returns) == 1

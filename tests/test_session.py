@@ -1,26 +1,53 @@
 """A logged run from Python: the run of the command line, silent, and gone on with."""
 
 import collections
+import copy
+import dataclasses
 import enum
+import functools
 import json
+import shutil
+import threading
+import time
+import types
 import warnings
 from dataclasses import dataclass, field
+from decimal import Decimal
+from fractions import Fraction
+from pathlib import Path
 from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+import yaml
 from helpers import composed, scalars
 
 import erl_torch
-from erl_torch import AlgorithmS1, EvaluationSettings, InputError, Note, Replicas, Simulation, StreamLearner
+from erl_torch import (
+    AlgorithmS1,
+    EvaluationSettings,
+    InputError,
+    NonFiniteError,
+    Note,
+    Replicas,
+    Simulation,
+    Status,
+    StreamLearner,
+)
+from erl_torch.envs.tabular import TabularEnv
 from erl_torch.envs.windy_cliff import WindyCliffEnv
 from erl_torch.experience.sources import Simulate
-from erl_torch.learners import Exact
+from erl_torch.learners import CertaintyEquivalence, Exact
 from erl_torch.learners.learner import columns
+from erl_torch.learners.s1.algorithm import S1State
+from erl_torch.log.event_file import EventFile
 from erl_torch.run.checkpoint import check_state, decode, encode
+from erl_torch.run.identity import plain
+from erl_torch.run.replicas import _status
 from erl_torch.run.training import train as train_configured
+from erl_torch.solvers.policy import objective
 
 MDP = WindyCliffEnv().mdp
 SHORT = AlgorithmS1(n_epochs=2, n_bias=2)
@@ -410,3 +437,431 @@ def test_streams_in_another_order_are_another_run(tmp_path, tuples):
     erl_torch.train(replicas, MDP, streams, directory=tmp_path, evaluation=QUICK)
     with pytest.raises(InputError, match="with these settings, or a new one: not digest="):
         erl_torch.train(replicas, MDP, streams[::-1], directory=tmp_path, evaluation=QUICK)
+
+
+# -- what a directory is of ------------------------------------------------------------------------------
+
+
+class Mode(enum.Enum):
+    A = 1
+    B = 2
+
+
+class Word(enum.StrEnum):
+    A = "a"
+    B = "b"
+
+
+class Slots:
+    __slots__ = ("x",)
+
+    def __init__(self, x):
+        self.x = x
+
+
+def tripled(x):
+    return 3 * x
+
+
+PAIRS = [
+    (Mode.A, Mode.B),
+    (Word.A, Word.B),
+    ({1, 2}, {1, 3}),
+    (frozenset("ab"), frozenset("ac")),
+    (1j, 2j),
+    (Fraction(1, 3), Fraction(1, 4)),
+    (Decimal("1.0"), Decimal("1.1")),
+    (b"ab", b"ac"),
+    (Path("a"), Path("b")),
+    (np.datetime64("2026-01-01"), np.datetime64("2026-01-02")),
+    (slice(1), slice(2)),
+    (lambda x: x + 1, lambda x: x + 2),
+    (functools.partial(tripled, 1), functools.partial(tripled, 2)),
+    (Slots(1), Slots(2)),
+    (types.SimpleNamespace(a=1), types.SimpleNamespace(a=2)),
+    (10**400, 10**401),
+    (np.arange(3), np.arange(3.0)),
+    (np.array([1, "a"], object), np.array([1, "b"], object)),
+    ([1, [2]], [1, [3]]),
+    ({"a": 1}, {"a": 2}),
+    (torch.zeros(2), torch.ones(2)),
+]
+
+
+@pytest.mark.parametrize(("one", "other"), PAIRS, ids=lambda value: type(value).__name__)
+def test_settings_that_differ_are_told_apart(one, other):
+    """A complete directory gave the solution of the other."""
+    first, second = plain("setting", one), plain("setting", other)
+    assert json.loads(json.dumps(first)) != json.loads(json.dumps(second))
+    assert yaml.safe_load(yaml.safe_dump(first)) == json.loads(json.dumps(first))
+    assert plain("setting", copy.deepcopy(one)) == first
+
+
+def test_a_setting_that_nothing_tells_is_refused():
+    with pytest.raises(InputError, match=r"setting=of class _thread.lock: must be a value that can be told"):
+        plain("setting", threading.Lock())
+    deep = value = []
+    for _ in range(50):
+        value.append([])
+        value = value[0]
+    with pytest.raises(InputError, match="objects deep"):
+        plain("setting", deep)
+
+
+def test_wrappers_and_limits_belong_to_a_run(tmp_path):
+    def learnt(env):
+        return erl_torch.train(SHORT, env, Simulate(5, 20), directory=tmp_path, evaluation=QUICK)
+
+    learnt(gym.make("FrozenLake-v1", max_episode_steps=10))
+    for other in (
+        gym.make("FrozenLake-v1", max_episode_steps=20),
+        gym.wrappers.TransformReward(gym.make("FrozenLake-v1", max_episode_steps=10), lambda r: 2 * r),
+    ):
+        with pytest.raises(InputError, match="of a run with these settings"):
+            learnt(other)
+
+
+# -- how a run ends ----------------------------------------------------------------------------------------
+
+
+class Failing(AlgorithmS1):
+    """Fails after ``good`` epochs."""
+
+    good: ClassVar[int] = 3
+    error: ClassVar[BaseException] = KeyboardInterrupt()
+
+    def step(self, state, stream):
+        if state.n_tuples >= self.good * len(stream.data):
+            raise self.error
+        return super().step(state, stream)
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), NonFiniteError(7, "lost"), RuntimeError("lost")])
+def test_the_last_epoch_is_recorded_however_the_run_ends(tmp_path, tuples, error, monkeypatch):
+    """The figures were those of the record before: the prior's."""
+    monkeypatch.setattr(Failing, "error", error)
+    rare = dataclasses.replace(QUICK, every=100)
+    with pytest.raises(type(error)):
+        erl_torch.train(Failing(), MDP, tuples, directory=tmp_path, evaluation=rare)
+    result = json.loads((tmp_path / "result.json").read_text())
+    policy = np.load(tmp_path / "solution.npz")["policy"]
+    assert result["objective"] == pytest.approx(float(objective(MDP, policy, np.full((15, 4), 0.25), 10.0)), abs=1e-9)
+    assert scalars(tmp_path)["eval/objective"][-1][0] == 3 * len(tuples)
+
+
+def test_the_same_bits_after_a_stop_between_records(tmp_path, tuples, monkeypatch):
+    rare = dataclasses.replace(QUICK, every=4)
+    learner = Failing(n_epochs=5, n_bias=2)
+    monkeypatch.setattr(Failing, "good", 10**9)
+    erl_torch.train(learner, MDP, tuples, directory=tmp_path / "whole", evaluation=rare)
+    monkeypatch.setattr(Failing, "good", 2)
+    with pytest.raises(KeyboardInterrupt):
+        erl_torch.train(learner, MDP, tuples, directory=tmp_path / "cut", evaluation=rare)
+    monkeypatch.setattr(Failing, "good", 10**9)
+    erl_torch.train(learner, MDP, tuples, directory=tmp_path / "cut", evaluation=rare)
+    assert (tmp_path / "cut/solution.npz").read_bytes() == (tmp_path / "whole/solution.npz").read_bytes()
+    assert scalars(tmp_path / "cut") == scalars(tmp_path / "whole")
+
+
+def test_a_run_whose_end_fails_is_not_complete(tmp_path, tuples, monkeypatch):
+    """It was "completed" for ever, without certificate; its records at the end came twice."""
+    whole = erl_torch.train(SHORT, MDP, tuples, directory=tmp_path / "whole", evaluation=QUICK)
+    for error in (OSError("disk full"), KeyboardInterrupt()):
+        directory = tmp_path / type(error).__name__
+        with monkeypatch.context() as patch:
+            patch.setattr("erl_torch.run.single.certify", raising(error))
+            with pytest.raises(type(error)):
+                erl_torch.train(SHORT, MDP, tuples, directory=directory, evaluation=QUICK)
+        result = directory / "result.json"
+        assert not result.exists() or json.loads(result.read_text())["status"] == "stopped"
+        again = erl_torch.train(SHORT, MDP, tuples, directory=directory, evaluation=QUICK)
+        assert again.gap == whole.gap
+        assert scalars(directory) == scalars(tmp_path / "whole")
+
+
+def raising(error):
+    def fail(*_, **__):
+        raise error
+
+    return fail
+
+
+class Diverging(AlgorithmS1):
+    """theta stays a number; the policy does not."""
+
+    def step(self, state, stream):
+        after = super().step(state, stream)
+        return dataclasses.replace(after, u=after.u * torch.nan) if after.n_tuples > 2 * len(stream.data) else after
+
+
+def test_a_policy_that_is_lost_is_non_finite(tmp_path, tuples):
+    """... said "stopped by the caller", and lost the run in the JSON of its result."""
+    for _ in range(2):  # a complete run says so again
+        with pytest.raises(NonFiniteError, match=r"no numbers|theta is nan"):
+            erl_torch.train(Diverging(), MDP, tuples, directory=tmp_path, evaluation=QUICK)
+    result = json.loads((tmp_path / "result.json").read_text())
+    assert result["status"] == "non_finite"
+    assert np.isfinite(np.load(tmp_path / "solution.npz")["policy"]).all()
+
+
+def test_a_directory_taken_away_is_said(tmp_path, tuples):
+    class Removed(AlgorithmS1):
+        def step(self, state, stream):
+            if state.n_tuples == 2 * len(tuples):
+                shutil.rmtree(tmp_path / "run")
+            return super().step(state, stream)
+
+    with pytest.warns(Note, match="was taken away while the run wrote to it"):
+        first = erl_torch.train(Removed(), MDP, tuples, directory=tmp_path / "run", evaluation=QUICK)
+    again = erl_torch.train(Removed(), MDP, tuples, directory=tmp_path / "run", evaluation=QUICK)
+    assert again.theta == first.theta
+
+
+def test_two_runs_in_a_new_directory(tmp_path):
+    """The one that came later overwrote the other's result."""
+
+    @dataclass(frozen=True, eq=False)
+    class Slow(Simulate):
+        def __call__(self, problem, seed, report):
+            with pytest.raises(InputError, match="no other run is writing to"):
+                erl_torch.train(SHORT, MDP, Simulate(5, 20), directory=tmp_path / "run", evaluation=QUICK)
+            return super().__call__(problem, seed, report)
+
+    erl_torch.train(SHORT, MDP, Slow(5, 20), directory=tmp_path / "run", evaluation=QUICK)
+
+
+def test_bad_input_after_a_stop_leaves_the_directory_alive(tmp_path, tuples, monkeypatch):
+    monkeypatch.setattr(Failing, "good", 0)
+    monkeypatch.setattr(Failing, "error", KeyboardInterrupt())
+    with pytest.raises(KeyboardInterrupt):
+        erl_torch.train(Failing(), MDP, tuples, directory=tmp_path, evaluation=QUICK)
+    monkeypatch.setattr(Failing, "error", InputError("tuples", 1, "others"))
+    with pytest.raises(InputError, match="others"):
+        erl_torch.train(Failing(), MDP, tuples, directory=tmp_path, evaluation=QUICK)
+    monkeypatch.setattr(Failing, "good", 10**9)
+    assert erl_torch.train(Failing(), MDP, tuples, directory=tmp_path, evaluation=QUICK).theta > 0
+
+
+def test_an_exact_solver_that_is_stopped_at_once_can_go_on(tmp_path, monkeypatch):
+    """It was REDUCIBLE for ever."""
+    with monkeypatch.context() as patch:
+        patch.setattr(Exact, "iterate", raising(KeyboardInterrupt()))
+        with pytest.raises(KeyboardInterrupt):
+            erl_torch.train(Exact(beta=2.0), MDP, directory=tmp_path, evaluation=QUICK)
+    assert erl_torch.train(Exact(beta=2.0), MDP, directory=tmp_path, evaluation=QUICK).status.name == "CONVERGED"
+
+
+# -- replicas ------------------------------------------------------------------------------------------------
+
+
+class Averaged(AlgorithmS1):
+    """Another step than its parent's."""
+
+    def step(self, state, stream):
+        after = super().step(state, stream)
+        return dataclasses.replace(after, u=(after.u + state.u) / 2)
+
+
+def test_replicas_of_a_derived_class_are_its_own():
+    """The parent's compiled loop ran instead."""
+    learner = Averaged(n_epochs=2, n_bias=2)
+    many = Replicas.of(learner, 2).fit(Simulation(MDP, 20, 100, seeds=[3, 4]), 15, 4)
+    for r, seed in enumerate((3, 4)):
+        alone = learner.fit(erl_torch.collect(MDP, 20, 100, seed=seed), 15, 4)
+        assert many[r].theta == alone.theta
+        assert torch.equal(many[r].policy, alone.policy)
+
+
+def test_replicas_are_told_by_their_own_seeds(tmp_path, capsys):
+    replicas = Replicas.of(SHORT, 2)
+    erl_torch.train(
+        replicas, MDP, Simulation(MDP, 5, 20, seeds=[7, 42]), directory=tmp_path, evaluation=QUICK, talks=True
+    )
+    assert "2 replicas (2 seeds from 7 to 42)" in capsys.readouterr().out
+    assert json.loads((tmp_path / "result.json").read_text())["seed"] == 7
+
+
+def test_settings_that_print_alike_have_their_own_curves(tmp_path, tuples):
+    erl_torch.train(Replicas.of(SHORT, beta=[2.0, 2.0000001]), MDP, tuples, directory=tmp_path, evaluation=QUICK)
+    tags = {tag.split("/")[0] for tag in scalars(tmp_path) if tag.startswith("beta")}
+    assert tags == {"beta_2", "beta_2.0000001"}
+
+
+@pytest.mark.parametrize(
+    ("statuses", "worst"),
+    [
+        ((Status.CONVERGED, Status.REDUCIBLE), "reducible"),
+        ((Status.CONVERGED, Status.STAGNATED), "stagnated"),
+        ((Status.COMPLETED, Status.UNCERTIFIED), "uncertified"),
+        ((Status.STEP_LIMIT, Status.STOPPED, Status.COMPLETED), "stopped"),
+        ((Status.PSI_LIMIT, Status.STEP_LIMIT, Status.CONVERGED), "psi_limit"),
+        (tuple(Status), "non_finite"),
+    ],
+)
+def test_the_worst_status_is_that_of_all(statuses, worst):
+    solution = types.SimpleNamespace(solutions=[types.SimpleNamespace(status=status) for status in statuses])
+    assert _status(solution) == worst
+
+
+def test_a_metric_of_another_shape_is_refused(tmp_path, tuples):
+    class Odd(AlgorithmS1):
+        def init(self, n_states, n_actions):
+            state = super().init(n_states, n_actions)
+            kind = type("OddState", (type(state),), {"metrics": lambda self: {"theta": np.zeros(3)}})
+            return kind(**{f.name: getattr(state, f.name) for f in dataclasses.fields(state)})
+
+    with pytest.raises(InputError, match="metrics of the learner, theta"):
+        erl_torch.train(Odd(), MDP, tuples, directory=tmp_path / "run", evaluation=QUICK)
+    assert not (tmp_path / "run").exists()
+
+
+# -- figures of a run --------------------------------------------------------------------------------------
+
+
+def test_records_stand_every_so_many_epochs(tmp_path, tuples):
+    rare = dataclasses.replace(QUICK, every=2)
+    erl_torch.train(AlgorithmS1(n_epochs=5, n_bias=1), MDP, tuples, directory=tmp_path, evaluation=rare)
+    steps = [step // len(tuples) for step, _ in scalars(tmp_path)["eval/objective"]]
+    assert steps == [0, 2, 4, 5]
+
+
+class Slow(Failing):
+    def step(self, state, stream):
+        time.sleep(0.05)
+        return super().step(state, stream)
+
+
+def test_seconds_go_on_after_a_stop(tmp_path, tuples, monkeypatch):
+    learner = Slow(n_epochs=4, n_bias=2)
+    with pytest.raises(KeyboardInterrupt):
+        erl_torch.train(learner, MDP, tuples, directory=tmp_path, evaluation=QUICK)
+    before = json.loads((tmp_path / "result.json").read_text())
+    monkeypatch.setattr(Failing, "good", 10**9)
+    erl_torch.train(learner, MDP, tuples, directory=tmp_path, evaluation=QUICK)
+    after = json.loads((tmp_path / "result.json").read_text())
+    assert after["seconds_learning"] >= before["seconds_learning"] + 4 * 0.05  # eight epochs, three before
+    assert after["seconds"] >= before["seconds"] + 4 * 0.05
+
+
+def test_replicas_that_play_go_on_with_the_same_episodes(tmp_path, monkeypatch):
+    """The generators of the episodes are part of a checkpoint, and of what an error in an epoch takes back."""
+    env = gym.make("FrozenLake-v1", max_episode_steps=20)
+    played = dataclasses.replace(QUICK, n_episodes=5)
+    learners = Replicas.of(Failing(beta=5.0, n_epochs=2, n_bias=3), 2)
+
+    def learnt(directory):
+        return erl_torch.train(learners, env, Simulate(20, 20), directory=directory, evaluation=played)
+
+    monkeypatch.setattr(Failing, "good", 10**9)
+    learnt(tmp_path / "whole")
+    monkeypatch.setattr(Failing, "good", 4)
+    with pytest.raises(KeyboardInterrupt):
+        learnt(tmp_path / "cut")
+    monkeypatch.setattr(Failing, "good", 10**9)
+    learnt(tmp_path / "cut")
+    assert (tmp_path / "cut/replicas.npz").read_bytes() == (tmp_path / "whole/replicas.npz").read_bytes()
+    assert scalars(tmp_path / "cut") == scalars(tmp_path / "whole")
+
+
+def test_seeds_are_those_of_the_call(tmp_path):
+    env = gym.make("FrozenLake-v1", max_episode_steps=20)
+    returns = {}
+    for seed in (0, 5):
+        erl_torch.train(Replicas.of(SHORT, 2), MDP, Simulate(5, 20), directory=tmp_path / f"r{seed}", seed=seed)
+        assert np.load(tmp_path / f"r{seed}/replicas.npz")["seed"].tolist() == [seed, seed + 1]
+        tuples = erl_torch.collect(env, 20, 20, seed=1)
+        directory = tmp_path / f"s{seed}"
+        played = dataclasses.replace(QUICK, n_episodes=50)
+        erl_torch.train(SHORT, env, tuples, directory=directory, seed=seed, evaluation=played)
+        returns[seed] = scalars(directory)["eval/return"]
+    assert returns[0] != returns[5]
+
+
+def test_the_learners_prior_counts(tmp_path, tuples):
+    prior = np.random.default_rng(0).dirichlet(np.ones(4), 15)
+    problem = erl_torch.Problem(TabularEnv(MDP), MDP, np.full((15, 4), 0.25), MDP)
+    learner = CertaintyEquivalence(beta=2.0, prior_policy=prior)
+    one = erl_torch.train(learner, problem, tuples, directory=tmp_path / "a", evaluation=QUICK)
+    other = erl_torch.train(learner, MDP, tuples, directory=tmp_path / "b", evaluation=QUICK)
+    assert one.gap == other.gap
+    lines = scalars(tmp_path / "a")["prior/objective"]
+    assert lines[0][1] == pytest.approx(objective(MDP, prior, prior, 2.0), abs=1e-5)
+
+
+def test_the_bar_counts_all_passes(tuples):
+    assert AlgorithmS1(n_epochs=3, n_bias=4).total(tuples) == 12 * len(tuples)
+    assert CertaintyEquivalence().total(tuples) == len(tuples)
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float16, np.int8, np.uint64, np.bool_])
+def test_metrics_keep_their_type_over_a_stop(tmp_path, tuples, monkeypatch, kind):
+    @dataclass(frozen=True, eq=False)
+    class Kept(S1State):
+        def metrics(self):
+            return {**super().metrics(), "x": kind(self.n_tuples % 7 / 3)}
+
+    class Own(Failing):
+        states = (Kept,)
+
+        def init(self, n_states, n_actions):
+            state = super().init(n_states, n_actions)
+            return Kept(**{f.name: getattr(state, f.name) for f in dataclasses.fields(state)})
+
+    def learnt(name):
+        return erl_torch.train(Own(n_epochs=3, n_bias=2), MDP, tuples, directory=tmp_path / name, evaluation=QUICK)
+
+    monkeypatch.setattr(Failing, "good", 10**9)
+    learnt("whole")
+    monkeypatch.setattr(Failing, "good", 2)
+    with pytest.raises(KeyboardInterrupt):
+        learnt("cut")
+    monkeypatch.setattr(Failing, "good", 10**9)
+    learnt("cut")
+    assert (tmp_path / "cut/solution.npz").read_bytes() == (tmp_path / "whole/solution.npz").read_bytes()
+
+
+def test_a_recording_written_to_is_noticed(tmp_path, tuples):
+    """With as many good rows as before, it was learnt from as it then was."""
+    tuples.save(tmp_path / "tuples.npz")
+    directory = erl_torch.write_experience(tuples, tmp_path / "columns")
+    data = erl_torch.read_experience(directory, 15, 4, chunk=1000)
+    rewards = np.load(directory / "r.npy")
+    time.sleep(0.02)  # of the file system's clock
+    np.save(directory / "r.npy", rewards + 1)
+    with pytest.raises(InputError, match="it has been written to"):
+        list(data.chunks())
+
+
+def test_sizes_of_a_recording_are_those_it_was_opened_with(tmp_path, tuples):
+    directory = erl_torch.write_experience(tuples, tmp_path / "columns")
+    data = erl_torch.read_experience(directory, 15, 4, chunk=1000)
+    for sizes in ((14, 4), (15, 3)):
+        with pytest.raises(InputError, match="those it was opened with"):
+            data.check_range(*sizes)
+
+
+def test_a_checkpoint_names_no_file_elsewhere(tmp_path):
+    """A mark cut the file that it named, wherever that was."""
+    victim = tmp_path / "victim"
+    victim.write_text("a" * 100)
+    for name in ("../victim", str(victim), "victim", "sub/events.out.tfevents.1"):
+        with pytest.raises(InputError, match="event file"):
+            EventFile(tmp_path / "run", (name, 5))
+    assert victim.read_text() == "a" * 100
+
+
+@pytest.mark.parametrize("rescale_every", [1, 10, 100])
+@pytest.mark.parametrize("implementation", ["fast", "literal"])
+def test_the_scale_of_u_is_free_with_the_prior_for_unvisited_pairs(rescale_every, implementation):
+    """... where a state is met as s' alone: its u was 1 whatever the scale of the others."""
+    rng = np.random.default_rng(0)
+    s, a, s_next, a_next = (rng.integers(n, size=200) for n in (2, 2, 3, 2))
+    data = erl_torch.Transitions(s, a, -1.0 - s * 0.5 - 0.3 * a, s_next, a_next)
+    found, once = (
+        AlgorithmS1(
+            beta=12.0, lr_u=0.1, n_epochs=3, n_bias=4, unvisited="prior", implementation=how, rescale_every=every
+        ).fit(data, 3, 2)
+        for how, every in ((implementation, rescale_every), ("literal", None))
+    )
+    assert found.theta == pytest.approx(once.theta, rel=1e-9)
+    np.testing.assert_allclose(found.policy, once.policy, rtol=1e-9)

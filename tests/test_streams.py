@@ -39,6 +39,7 @@ from erl_torch.experience.formats.minari import Minari
 from erl_torch.experience.formats.npy import ColumnWriter, check_target
 from erl_torch.experience.recording import FileRecording
 from erl_torch.experience.transitions import COLUMNS, regroup
+from erl_torch.labels import Labels
 from erl_torch.learners import LEARNERS
 from erl_torch.rng import streams
 from erl_torch.run.training import train
@@ -533,9 +534,36 @@ def test_minari_boxes_are_binned():
     env = Discretise(gym.make("Pendulum-v1"), 4, actions=5)  # -2, -1, 0, 1, 2
     source = Minari("minari:none", Options(64, 5, env))
     actions = np.array([[1.2], [-1.6], [2.0], [0.4]], np.float32)
-    assert source._actions(actions, env.env).tolist() == [3, 0, 4, 2]
+    assert source._actions(actions, env.env, 4).tolist() == [3, 0, 4, 2]
     seen = np.array([[-0.9, 0.1, 7.0], [0.9, -0.6, -1.0]])
-    assert source._states(seen, env.env.observation_space).tolist() == [0 + 2 * 4 + 3 * 16, 3 + 0 * 4 + 1 * 16]
+    assert source._states(seen, env.env.observation_space, 2).tolist() == [0 + 2 * 4 + 3 * 16, 3 + 0 * 4 + 1 * 16]
+
+
+def test_minari_spaces_of_parts_are_numbered(tmp_path, monkeypatch):
+    """The same episodes, with observations of two parts and actions of one bit each, are the same tuples by name."""
+    import minari
+    from minari.data_collector import EpisodeBuffer
+
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    seen = {"row": np.array([0, 1, 1]), "column": np.array([1, 2, 0])}
+    actions, ends, never = [np.array([1, 0], np.int8)] * 2, [False, True], [False, False]
+    buffers = [EpisodeBuffer(i, None, None, seen, actions, [0.0, 1.0], ends, never, None) for i in range(2)]
+    space = gym.spaces.Dict(row=gym.spaces.Discrete(2), column=gym.spaces.Discrete(3))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        minari.create_dataset_from_buffers(
+            "erl/parts-v0",
+            buffers,
+            observation_space=space,
+            action_space=gym.spaces.MultiBinary(2),
+            eval_env=None,
+            **dict.fromkeys(("description", "algorithm_name", "author", "author_email", "code_permalink"), "x"),
+        )
+    labels = Labels.of_space(space)
+    data = read_experience("minari:erl/parts-v0", 6, 4)
+    assert [labels.decode(int(s)) for s in data.s[:2]] == [{"row": 0, "column": 1}, {"row": 1, "column": 2}]
+    assert [labels.decode(int(s)) for s in data.s_next[:2]] == [{"row": 1, "column": 2}, {"row": 0, "column": 1}]
+    assert data.a.tolist() == [2] * 4
 
 
 def kept(path):

@@ -6,7 +6,6 @@ work is imported when it begins: torch takes seconds, and --help and Tab complet
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -16,6 +15,7 @@ from omegaconf import DictConfig
 
 from erl_torch import configurations
 from erl_torch.cli import main as cli
+from erl_torch.guesses import did_you_mean
 from erl_torch.reproduction import ARTIFACTS
 
 TRAIN = """Learn the optimal entropy-regularised policy of a stochastic MDP from a stream of tuples.
@@ -23,9 +23,11 @@ TRAIN = """Learn the optimal entropy-regularised policy of a stochastic MDP from
 python train.py env=windy_cliff                        the paper's Figure 5
 python train.py learner.beta=5 experience.n_episodes=200
 python train.py env=FrozenLake-v1                      any environment of Gymnasium's with finite spaces
+python train.py env=my_module:MyEnv                    one of your own: a class of my_module.py, or an id it registers
 python train.py learner=s1_efficient                   the learner to use
-python train.py learner.class=my_package.MyLearner     one of your own; env.class and experience.class likewise
+python train.py learner.class=my_package.MyLearner     one of your own; experience.class likewise
 python train.py -m learner.beta=2,5,10 seed=0,1        one run per combination
+python train.py resume=RUN_DIR                         go on after a stop
 tensorboard --logdir runs                              look at the runs
 """
 
@@ -129,10 +131,10 @@ def main() -> None:
         asked = given in ("-h", "--help")
         lines = [f"erl-torch {name} ...    {text.splitlines()[0]}" for name, (_, text) in COMMANDS.items()]
         if not asked:
-            print(f"error: {given or 'no command'}: must be one of {', '.join(COMMANDS)}", file=sys.stderr)
+            hint = did_you_mean(given, COMMANDS)
+            print(f"error: {given or 'no command'}: must be one of {', '.join(COMMANDS)}{hint}", file=sys.stderr)
         print("\n".join(lines), file=sys.stdout if asked else sys.stderr)
         raise SystemExit(0 if asked else 2)
-    sys.path.append(os.getcwd())  # for classes of one's own; Python does it for scripts
     command, _ = COMMANDS[sys.argv.pop(1)]
     command()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
 
 from erl_torch import configurations
+from erl_torch.cli.paths import quoted
 from erl_torch.run.settings import Compare, Play, Reproduce, Standard, Suggest, Train
 
 NOT_COMPARED = ("exact",)  # it solves the model, and learns from no stream
@@ -32,7 +34,7 @@ def default_env(experience: str) -> str:
 def run_name(number: int, overrides: str) -> str:
     """``NNN-key=value-...`` of a multirun job: keys without their group, at most 80 characters."""
     parts = [part.lstrip("+~").split(".")[-1] if "=" not in part else
-             part.split("=", 1)[0].lstrip("+~").split(".")[-1] + "=" + part.split("=", 1)[1]
+             part.split("=", 1)[0].lstrip("+~").split(".")[-1] + "=" + part.split("=", 1)[1].strip("'\"")
              for part in overrides.split(",") if part]  # fmt: skip
     return f"{int(number):03d}-{slug('-'.join(parts))}"[:80]
 
@@ -51,15 +53,20 @@ def register() -> None:
     OmegaConf.register_new_resolver("run_name", run_name, replace=True)
 
 
+def options(arguments: Sequence[str]) -> Namespace:
+    """Hydra's own options among the arguments of a command, as ``multirun``; the others as ``overrides``."""
+    return get_args_parser().parse_known_args(list(arguments))[0]
+
+
 def config_dir(arguments: Sequence[str]) -> Path | None:
     """The folder of ``--config-dir`` among the arguments of a command."""
-    folder = get_args_parser().parse_known_args(list(arguments))[0].config_dir
+    folder = options(arguments).config_dir
     return None if folder is None else Path(folder)
 
 
 def overrides(arguments: Sequence[str]) -> list[str]:
     """The arguments of a command without Hydra's options."""
-    return list(get_args_parser().parse_known_args(list(arguments))[0].overrides)
+    return list(options(arguments).overrides)
 
 
 def composed(conf: Path, config_name: str, arguments: Sequence[str]) -> DictConfig:
@@ -67,6 +74,6 @@ def composed(conf: Path, config_name: str, arguments: Sequence[str]) -> DictConf
     of_ours = [a for a in overrides(arguments) if not a.startswith("hydra")]
     folder = config_dir(arguments)
     if folder is not None:
-        of_ours.append("hydra.searchpath=['file://{}']".format(str(folder.resolve()).replace("'", "\\'")))
+        of_ours.append(f"hydra.searchpath=[{quoted(f'file://{folder.resolve()}')}]")
     with initialize_config_dir(str(conf.resolve()), version_base="1.3"):
         return compose(config_name, of_ours)

@@ -7,8 +7,10 @@ directory alone names is not imported: that would run code which nobody has aske
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+import shlex
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from hydra.core.config_store import ConfigStore
 from omegaconf import DictConfig, OmegaConf
@@ -18,6 +20,29 @@ from erl_torch.cli.config import composed, config_dir
 from erl_torch.run.classes import GROUPS, foreign, is_own, offered, parameters, resolve
 
 PATH = re.compile(r"[A-Za-z_]\w*(\.\w+)+")
+COLON = re.compile(r"([A-Za-z_]\w*(?:\.\w+)*):([A-Za-z_]\w*)")  # MODULE:CLASS, as others write it
+CHOICE = re.compile(r"\+{0,2}(env|learner|experience)(@[\w.]+|(\.\w+)?\.class)?")
+
+
+def dotted(argument: str) -> str:
+    """``argument`` with MODULE.CLASS for MODULE:CLASS where it chooses a group or a class.
+
+    Raises InputError for a module that cannot be imported or has no such class, and for a ``class`` without a module.
+    """
+    key, _, value = argument.partition("=")
+    match = CHOICE.fullmatch(key)
+    if match is None:
+        return argument
+    names = value.split(",")
+    if key.endswith(".class"):
+        for name in names:
+            if not (PATH.fullmatch(name) or COLON.fullmatch(name)) and re.fullmatch(r"[A-Za-z_]\w*", name):
+                resolve(name, key)  # raises: no module
+    for i, name in enumerate(names):
+        if parts := COLON.fullmatch(name):
+            names[i] = f"{parts[1]}.{parts[2]}"
+            resolve(names[i], key)
+    return f"{key}={','.join(names)}"
 
 
 def choices(arguments: Sequence[str], conf: Path) -> list[str]:
@@ -65,28 +90,55 @@ def offer(arguments: Sequence[str]) -> list[str]:
 
 
 def named_again(directory: Path, arguments: Sequence[str], typed: Sequence[str]) -> None:
-    """Raise InputError for a class that ``arguments``, those of a run directory among them, make the command line
+    """Raise InputError for classes that ``arguments``, those of a run directory among them, make the command line
     import, and that nobody has ``typed``."""
-    for group, path in paths(arguments):
-        _require(directory, f"{group}.class", path, typed)
+    named = {f"{group}.class={path}": path for group, path in paths(arguments)}
+    if missing := _missing(named, typed):
+        _refuse(directory, [*missing, *(a for a in needed(directory) if not _is_typed(a, typed))])
 
 
 def composed_again(directory: Path, arguments: Sequence[str], typed: Sequence[str], conf: Path, name: str) -> None:
-    """Raise InputError for a class, or a module of an environment, that the configuration of a run directory comes to,
+    """Raise InputError for classes, or a module of an environment, that the configuration of a run directory comes to,
     and that nobody has ``typed``."""
     cfg = composed(conf, name, arguments)
-    for key, path in foreign(cfg).items():
-        _require(directory, key, path, typed)
-    env_id = str(cfg.env.get("id"))
-    module = env_id.partition(":")[0]
-    if ":" in env_id and not any(f"{module}:" in a.partition("=")[2] for a in typed if a.lstrip("+").startswith("env")):
-        raise InputError("resume", directory, f"named with its module, which is imported: add env={env_id}")
+    _refuse(directory, [argument for argument in _imported(cfg) if not _is_typed(argument, typed)])
 
 
-def _require(directory: Path, key: str, path: str, typed: Sequence[str]) -> None:
-    if is_own(path) or path in {name for _, name in paths(typed)} or path in _of_files(typed):
-        return
-    raise InputError("resume", directory, f"named with its class, which is imported: add {key}={path}")
+def needed(directory: Path) -> list[str]:
+    """What has to be typed beside resume=``directory``: the classes and modules that its configuration names."""
+    path = directory / ".hydra" / "config.yaml"
+    try:
+        return _imported(OmegaConf.load(path))
+    except Exception:  # of a file of any kind: whoever resumes is told
+        return []
+
+
+def _imported(cfg: Any) -> list[str]:  # a configuration
+    """KEY=PATH of each class outside this package that ``cfg`` names, and env=MODULE:ID."""
+    named = [f"{key}={path}" for key, path in foreign(cfg).items()]
+    env = cfg.get("env")
+    env_id = str(env.get("id")) if isinstance(env, DictConfig) else ""
+    return named + [f"env={env_id}"] * (":" in env_id)
+
+
+def _is_typed(argument: str, typed: Sequence[str]) -> bool:
+    path = argument.partition("=")[2]
+    module, colon, _ = path.partition(":")
+    if colon:
+        return any(f"{module}:" in a.partition("=")[2] for a in typed if a.lstrip("+").startswith("env"))
+    return is_own(path) or path in {name for _, name in paths(typed)} or path in _of_files(typed)
+
+
+def _missing(named: Mapping[str, str], typed: Sequence[str]) -> list[str]:
+    return [argument for argument in named if not _is_typed(argument, typed)]
+
+
+def _refuse(directory: Path, missing: Sequence[str]) -> None:
+    """Raise InputError if anything is ``missing``: all of it at once."""
+    if missing := list(dict.fromkeys(missing)):
+        what = "class, which is" if len(missing) == 1 else "classes, which are"
+        what = "module, which is" if ":" in missing[0] else what
+        raise InputError("resume", directory, f"named with its {what} imported: add {shlex.join(missing)}")
 
 
 def _of_files(typed: Sequence[str]) -> set[str]:

@@ -11,7 +11,9 @@ import contextlib
 import logging
 import math
 import re
+import shlex
 import shutil
+import statistics
 import subprocess
 import sys
 import time
@@ -22,17 +24,24 @@ from types import NoneType
 from typing import Any
 
 from hydra.core.config_store import ConfigStore
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
 from hydra.core.utils import JobReturn, JobStatus
+from hydra.errors import HydraException
 from hydra.plugins.launcher import Launcher
 from omegaconf import DictConfig, flag_override, read_write
 
 from erl_torch.checks import InputError, is_number
-from erl_torch.files import alone, read_json, write_json
+from erl_torch.cli.paths import quoted
+from erl_torch.files import alone, here, read_json, write_json
 from erl_torch.output import lasting
+from erl_torch.run.origin import key_of
 
 EXTRAS = {"joblib": "joblib", "submitit_slurm": "slurm", "submitit_local": "slurm", "optuna": "optuna"}
-COLUMNS = ("theta", "objective", "gap", "seconds")  # of result.json
+FIGURES = ("objective", "theta", "gap")  # of result.json, the first to compare jobs of one problem by
+COLUMNS = (*FIGURES, "seconds")
+OF_THE_PROBLEM = ("learner.beta", "learner.prior_policy", "experience.path")  # and all of env: settings that change it
+MOST_ROWS = 40  # of jobs that are printed beside their means over seeds; sweep.json has all
 LONG_NUMBER = r"(?<==)-?\d*\.\d{5,}(e-?\d+)?$"
 UNFINISHED = ("waiting", "running")
 FINISHED = ("ended", "failed")  # statuses of jobs that are not started again
@@ -40,6 +49,24 @@ FINISHED = ("ended", "failed")  # statuses of jobs that are not started again
 SLURM_ENDS = {"BOOT_FAIL", "CANCELLED", "COMPLETED", "DEADLINE", "FAILED", "NODE_FAIL", "OUT_OF_MEMORY", "PREEMPTED"}
 SLURM_ENDS |= {"TIMEOUT", "GONE"}
 ASK_SLURM = 5.0  # seconds between questions to Slurm
+
+
+def directory(arguments: Sequence[str]) -> list[str]:
+    """hydra.sweep.dir of a sweep over environments: it is named for none of them."""
+    given = any(a.startswith("hydra.sweep.dir=") for a in arguments)
+    return [] if given or "env" not in varying(arguments) else ["hydra.sweep.dir=runs/sweep-${now:%m%d-%H%M%S-%f}"]
+
+
+def varying(arguments: Sequence[str]) -> list[str]:
+    """The keys among ``arguments`` that take several values."""
+    read = OverridesParser.create()
+    found = []
+    for argument in arguments:
+        with contextlib.suppress(HydraException):  # Hydra says what is wrong
+            override = read.parse_override(argument)
+            if override.is_sweep_override():
+                found.append(override.key_or_group)
+    return found
 
 
 def presets() -> None:
@@ -145,7 +172,7 @@ def collect(sweep: Path) -> list[dict[str, Any]]:
             row["status"] = str(result.get("status", "completed"))
         if row["directory"] and not (sweep / row["directory"]).exists():
             row["directory"] = None  # bad input: nothing was written
-    write_json(sweep / "sweep.json", {"jobs": rows})
+    write_json(sweep / "sweep.json", {"jobs": rows, "averages": averages(rows)})
     if all(row["status"] not in UNFINISHED for row in rows):
         shutil.rmtree(sweep / ".jobs", ignore_errors=True)
     return rows
@@ -155,43 +182,119 @@ def failures(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     return [row for row in rows if row["status"] == "failed"]
 
 
+def averages(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Jobs that differ in their seed alone, together: overrides without it, number of jobs, and [mean, sd] of figures.
+
+    sd: of a sample (n - 1); None of fewer than two. Empty where no two jobs differ in their seed alone.
+    """
+    groups: dict[tuple[str, ...], list[dict[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault(tuple(o for o in row["overrides"] if key_of(o) != "seed"), []).append(row)
+    if len(groups) == len(rows):
+        return []
+    found = []
+    for overrides, members in groups.items():
+        average: dict[str, Any] = {"overrides": list(overrides), "jobs": len(members)}
+        for name in FIGURES:
+            values = [row[name] for row in members if row[name] is not None]
+            sd = statistics.stdev(values) if len(values) > 1 else None
+            average[name] = [statistics.fmean(values), sd] if values else None
+        found.append(average)
+    return found
+
+
+def _problem(overrides: Sequence[str]) -> tuple[str, ...]:
+    """What two jobs must share for their objectives to measure the same thing."""
+    return tuple(o for o in overrides if key_of(o).split(".")[0] == "env" or key_of(o) in OF_THE_PROBLEM)
+
+
+def _best(candidates: Sequence[tuple[tuple[str, ...], float | None]]) -> set[int]:
+    """Positions of the largest objective of each problem, among (problem, objective); of a lone one there is none."""
+    groups: dict[tuple[str, ...], list[tuple[float, int]]] = {}
+    for i, (problem, objective) in enumerate(candidates):
+        if objective is not None:
+            groups.setdefault(problem, []).append((objective, -i))
+    return {-max(group)[1] for group in groups.values() if len(group) > 1}
+
+
 def table(sweep: Path, rows: Sequence[dict[str, Any]]) -> str:
-    """The rows of ``collect`` as text, with one line per failure below."""
+    """The rows of ``collect`` as text, means over seeds, and one line per failure below.
+
+    The best job, or mean, of each problem is marked. The first figure is the one to compare by: the objective, or
+    where problems differ the gap to the optimum of each.
+    """
     shared = [o for o in rows[0]["overrides"] if len(rows) > 1 and all(o in row["overrides"] for row in rows)]
+    problems = {_problem(row["overrides"]) for row in rows}
+    columns = [name for name in FIGURES if any(row[name] is not None for row in rows)]
+    if len(problems) > 1:
+        columns.sort(key="gap".__ne__)
 
-    def own(row: dict[str, Any]) -> str:
-        # Sweepers draw numbers of 17 digits.
-        return " ".join(
-            re.sub(LONG_NUMBER, lambda n: f"{float(n[0]):.4g}", o) for o in row["overrides"] if o not in shared
-        )
+    def own(overrides: Sequence[str]) -> str:
+        # Sweepers draw numbers of 17 digits; Hydra escapes colons.
+        texts = (re.sub(LONG_NUMBER, lambda n: f"{float(n[0]):.4g}", o) for o in overrides if o not in shared)
+        return " ".join(texts).replace("\\:", ":")
 
-    def figure(name: str, value: float | None) -> str:
-        return "" if value is None else f"{value:.1f}" if name == "seconds" else f"{value:.6g}"
-
-    lines = [("job", "overrides", "status", *COLUMNS, "directory")]
-    lines += [
-        (str(row["job"]), own(row), row["status"], *(figure(c, row[c]) for c in COLUMNS), row["directory"] or "")
-        for row in rows
-    ]
-    width = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    left = (1, 2, len(width) - 1)  # columns of text
-    text = [
-        "  ".join(f"{c:<{w}}" if i in left else f"{c:>{w}}" for i, (c, w) in enumerate(zip(line, width, strict=True)))
-        for line in lines
-    ]
-    with contextlib.suppress(ValueError):
-        sweep = sweep.resolve().relative_to(Path.cwd())
+    means = averages(rows)
+    best = set() if means else _best([(_problem(row["overrides"]), row["objective"]) for row in rows])
+    text = []
+    if len(rows) <= MOST_ROWS or not means:
+        head = ("", "job", "overrides", *columns, "status", "seconds", "directory")
+        text += _aligned(
+            [
+                head,
+                *(
+                    ("*" if i in best else "", str(row["job"]), own(row["overrides"]),
+                     *("" if row[c] is None else f"{row[c]:z.6g}" for c in columns), row["status"],
+                     "" if row["seconds"] is None else f"{row['seconds']:.1f}", row["directory"] or "")
+                    for i, row in enumerate(rows)
+                ),
+            ]
+        )  # fmt: skip
+    if means:
+        best = _best([(_problem(mean["overrides"]), (mean["objective"] or [None])[0]) for mean in means])
+        head = ("", "jobs", "mean +- sd over seeds", *columns)
+        text += [""] * bool(text) + _aligned(
+            [
+                head,
+                *(
+                    ("*" if i in best else "", str(mean["jobs"]), own(mean["overrides"]),
+                     *(_mean(mean[c]) for c in columns))
+                    for i, mean in enumerate(means)
+                ),
+            ]
+        )  # fmt: skip
+    if best:
+        text.append("* the largest objective" + " of each problem" * (len(problems) > 1))
+    where = here(sweep)
     failed, unfinished = failures(rows), sum(row["status"] in UNFINISHED for row in rows)
     counts = f"{len(rows)} jobs, {len(failed)} failed" + (f", {unfinished} not finished" if unfinished else "")
     return "\n".join(
         [
             "",
-            *(line.rstrip() for line in text),
+            *text,
             *([f"all jobs: {' '.join(shared)}"] if shared else []),
-            f"{counts}; table: {sweep}/sweep.json; tensorboard --logdir {sweep}",
-            *(f"failed: job {row['job']} ({own(row)}): {row['complaint']}" for row in failed),
+            f"{counts}; table: {where}/sweep.json; tensorboard --logdir {shlex.quote(str(where))}",
+            *(f"failed: job {row['job']} ({own(row['overrides'])}): {row['complaint']}" for row in failed),
         ]
     )
+
+
+def _mean(found: list[float | None] | None) -> str:
+    if found is None or found[0] is None:
+        return ""
+    mean, sd = found
+    return f"{mean:z.6g}" + ("" if sd is None else f" +- {sd:.2g}")
+
+
+def _aligned(lines: Sequence[tuple[str, ...]]) -> list[str]:
+    """Rows of cells as lines; text to the left, what stands between the third cell and the status to the right."""
+    width = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    left = {0, 2} | {i for i, name in enumerate(lines[0]) if name in ("status", "directory")}
+    return [
+        "  ".join(f"{c:<{w}}" if i in left else f"{c:>{w}}" for i, (c, w) in enumerate(zip(line, width, strict=True)))
+        .rstrip()
+        for line in lines
+    ]  # fmt: skip
 
 
 # -- launchers --------------------------------------------------------------------------------------
@@ -205,11 +308,14 @@ def patient_launchers() -> Iterator[list[Path]]:
 
     def instantiate_launcher(self: Plugins, *, config: DictConfig, **more: Any) -> Launcher:  # Any: as Hydra has it
         directory = str(config.hydra.sweep.dir)
+        # Jobs are named by what varies: this is left out.
+        task = list(map(str, config.hydra.overrides.task))
+        same = sorted({key_of(a) for a in task} - set(varying(task)))
         # One directory for all jobs, even where its name depends on a key that is swept over.
-        quoted = directory.replace("\\", "\\\\").replace("'", "\\'")
         given = config.hydra.overrides.hydra
         with read_write(given), flag_override(given, "struct", False):
-            given.append(f"hydra.sweep.dir='{quoted}'")
+            given.append(f"hydra.sweep.dir={quoted(directory)}")
+            given.append(f"hydra.job.config.override_dirname.exclude_keys=[{','.join(map(quoted, same))}]")
         return _Patient(make(self, config=config, **more), Path(directory), sweeps)
 
     Plugins.instantiate_launcher = instantiate_launcher  # type: ignore[method-assign,assignment]
@@ -231,6 +337,7 @@ class _Patient(Launcher):
         """Do nothing: ``inner`` is ready."""
 
     def launch(self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> Sequence[JobReturn]:
+        _check_slurm(self.inner)
         jobs = {n: list(overrides) for n, overrides in enumerate(job_overrides, initial_job_idx)}
         _plan(self.sweep, jobs, anew=self.sweep not in self.sweeps)
         if self.sweep not in self.sweeps:
@@ -265,6 +372,9 @@ class _Patient(Launcher):
                     fail(self.sweep, number, "it did not start")
                     del todo[number]
             if error is not None and before == (len(todo), len(died)):
+                if type(error).__module__.startswith("submitit"):
+                    last = str(error).strip().splitlines()[-1]
+                    raise InputError("hydra/launcher", type(self.inner).__name__, f"one that starts jobs ({last})")
                 raise error
         return [self._returned(number, overrides) for number, overrides in jobs.items()]
 
@@ -281,6 +391,13 @@ class _Patient(Launcher):
     def _returned(self, number: int, overrides: list[str]) -> JobReturn:
         value = _read(_note(self.sweep, number)).get("value")
         return JobReturn(overrides=overrides, status=JobStatus.COMPLETED, _return_value=value)
+
+
+def _check_slurm(launcher: Launcher) -> None:
+    """Raise InputError where jobs are for Slurm and it is not on this machine."""
+    if type(launcher).__name__ == "SlurmLauncher" and shutil.which("srun") is None:
+        allowed = "used where Slurm is (there is no srun here); joblib runs jobs on all cores of one machine"
+        raise InputError("hydra/launcher", "submitit_slurm", allowed)
 
 
 @contextlib.contextmanager

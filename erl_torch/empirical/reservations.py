@@ -25,6 +25,7 @@ from erl_torch.empirical.counts import EmpiricalMDP, Tally, empirical_mdp, tally
 from erl_torch.empirical.uncertainty import Estimate
 from erl_torch.experience.experience import Experience
 from erl_torch.experience.transitions import Transitions
+from erl_torch.labels import NUMBERS, Names
 from erl_torch.mdp.tabular import TabularMDP
 from erl_torch.solution import Status, proven
 from erl_torch.solvers.chains import reachable_from
@@ -58,6 +59,7 @@ class Counted:
     tally: Tally
     model: EmpiricalMDP | None  # None where the squares of rewards overflow
     next_actions: np.ndarray | None  # counts of (s',a'), [S, A]
+    names: Names = NUMBERS  # for texts
 
 
 class StreamNeeds(Protocol):
@@ -98,7 +100,7 @@ class _Passing:
             yield chunk
 
 
-def count(data: Experience, n_states: int, n_actions: int, next_actions: bool) -> Counted:
+def count(data: Experience, n_states: int, n_actions: int, next_actions: bool, names: Names = NUMBERS) -> Counted:
     """Count ``data``; with ``next_actions`` (s',a') too. Raises InputError as ``tally`` does."""
     passing = _Passing(data, n_states, n_actions) if next_actions else None
     seen = tally(passing or data, n_states, n_actions)
@@ -106,7 +108,7 @@ def count(data: Experience, n_states: int, n_actions: int, next_actions: bool) -
         model = empirical_mdp(data, n_states, n_actions, seen)
     except InputError:  # of the size of rewards
         model = None
-    return Counted(seen, model, passing.counts if passing else None)
+    return Counted(seen, model, passing.counts if passing else None, names)
 
 
 def of_stream(counted: Counted, learner: StreamNeeds, prior: np.ndarray) -> list[Reservation]:
@@ -149,7 +151,7 @@ def of_noise(counted: Counted, beta: float) -> list[Reservation]:
         Reservation(
             "rewards vary",
             "rewards vary for the same (s,a), and this learner averages exp(beta r): theta is too low, by about "
-            f"{size} at the noisiest pair (s={s}, a={a}), and the policy seeks the noise; "
+            f"{size} at the noisiest pair ({counted.names.pair(int(s), int(a))}), and the policy seeks the noise; "
             "learner=certainty_equivalence takes mean rewards",
         )
     ]
@@ -212,7 +214,7 @@ def of_model(
 
     Of actions that are not to be taken (prior 0) give ``mdp.restricted``: then they need not be met.
     """
-    contradictions = [*_transitions(counted.tally, mdp), *_rewards(counted, mdp)]
+    contradictions = [*_transitions(counted.tally, mdp, counted.names), *_rewards(counted, mdp)]
     if estimate is not None and bounds is not None and _covered(counted.tally, mdp):
         contradictions += _theta(estimate, bounds)
     if not contradictions:
@@ -230,7 +232,7 @@ def _entries(seen: Tally, mdp: TabularMDP) -> tuple[np.ndarray, np.ndarray]:
     return at, listed[at] == met
 
 
-def _transitions(seen: Tally, mdp: TabularMDP) -> Iterator[str]:
+def _transitions(seen: Tally, mdp: TabularMDP, names: Names) -> Iterator[str]:
     p = mdp.transition
     at, possible = _entries(seen, mdp)
     if not possible.all():
@@ -238,9 +240,10 @@ def _transitions(seen: Tally, mdp: TabularMDP) -> Iterator[str]:
         worst = odd[np.argmax(seen.counts[odd])]
         pair = int(np.searchsorted(seen.indptr, worst, side="right")) - 1
         s, a = divmod(pair, mdp.n_actions)
+        symbol = "s'"
         yield (
-            f"{seen.counts[odd].sum():,} of {seen.counts.sum():,} transitions are impossible in it, as from s={s}, "
-            f"a={a} to s'={seen.indices[worst]} ({seen.counts[worst]:,} times)"
+            f"{seen.counts[odd].sum():,} of {seen.counts.sum():,} transitions are impossible in it, as from "
+            f"{names.pair(s, a)} to {names.state(int(seen.indices[worst]), symbol)} ({seen.counts[worst]:,} times)"
         )
     counts = np.zeros(p.nnz, np.int64)
     counts[at[possible]] = seen.counts[possible]
@@ -272,7 +275,7 @@ def _rewards(counted: Counted, mdp: TabularMDP) -> Iterator[str]:
         s, a = np.unravel_index(np.argmax(np.where(differs, off, -1.0)), off.shape)
         yield (
             f"mean rewards of {differs.sum()} of {(visits > 0).sum()} pairs are others, as {mean[s, a]:.6g} for "
-            f"{exact[s, a]:.6g} at s={s}, a={a}"
+            f"{exact[s, a]:.6g} at {counted.names.pair(int(s), int(a))}"
         )
 
 

@@ -128,7 +128,7 @@ class Estimate:
         if np.isnan(self.value):
             return f"no {self.name}: {self.withheld}"
         if self.withheld:
-            return f"{self.name} = {self.value:.4g}, no interval: {self.withheld}"
+            return f"{self.name} = {self.value:z.4g}, no interval: {self.withheld}"
         low, high = self.interval()
         distance = min(self.value - low, high - self.value)
         digits = 4
@@ -141,10 +141,10 @@ class Estimate:
         unit = 10.0**-digits
         if abs(0.5 * (low + high) - self.value) > LOPSIDED * 0.5 * (high - low):
             low, high = np.floor(low / unit) * unit, np.ceil(high / unit) * unit
-            return f"{self.name} = {self.value:.{digits}f} in [{low:.{digits}f}, {high:.{digits}f}]"
+            return f"{self.name} = {self.value:z.{digits}f} in [{low:z.{digits}f}, {high:z.{digits}f}]"
         printed = float(f"{self.value:.{digits}f}")
         half = max(0.0, np.ceil(max(high - printed, printed - low) / unit - 1e-9)) * unit
-        return f"{self.name} = {self.value:.{digits}f} +- {half:.{digits}f}"
+        return f"{self.name} = {self.value:z.{digits}f} +- {half:.{digits}f}"
 
 
 def _normal(level: float) -> float:

@@ -37,6 +37,14 @@ ENTRY_POINTS = {
     "erl_torch/WindyMaze-v0": "windy_maze:WindyMazeEnv",
     "erl_torch/DynamicsShift-v0": "shift:DynamicsShiftEnv",
     "erl_torch/TabularMDP-v0": "tabular:TabularFileEnv",
+    "erl_torch/AccessControl-v0": "access_control:AccessControlEnv",
+    "erl_torch/Admission-v0": "admission:AdmissionEnv",
+    "erl_torch/CarRental-v0": "car_rental:CarRentalEnv",
+    "erl_torch/Forest-v0": "forest:ForestEnv",
+    "erl_torch/Inventory-v0": "inventory:InventoryEnv",
+    "erl_torch/MachineReplacement-v0": "machine_replacement:MachineReplacementEnv",
+    "erl_torch/RiverSwim-v0": "river_swim:RiverSwimEnv",
+    "erl_torch/TwoChoice-v0": "two_choice:TwoChoiceEnv",
     **CONTROL_ENTRY_POINTS,
 }
 

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from erl_torch.envs.grid_world import TILES, GridWorld
+from erl_torch.labels import NUMBERS, Names
 from erl_torch.pictures import DPI, MAX_PX, colour_bar, pixels, table_picture
 
 TILE_COLOURS = {
@@ -38,11 +39,15 @@ def grid_of(env: gym.Env[Any, Any]) -> GridWorld | None:
 
 
 def policy_picture(
-    policy: np.ndarray, grid: GridWorld | None = None, title: str = "", max_px: int = MAX_PX
+    policy: np.ndarray,
+    grid: GridWorld | None = None,
+    title: str = "",
+    max_px: int = MAX_PX,
+    names: Names = NUMBERS,
 ) -> np.ndarray:
     """The policy [S, A]: arrows as long as their probability on a grid, else a table of shades."""
     if grid is None:
-        return table_picture(policy, title, "pi(a|s)", max_px)
+        return table_picture(policy, title, "pi(a|s)", max_px, names)
     return grid_picture(grid, policy, title=title, max_px=max_px)
 
 
@@ -101,12 +106,16 @@ def share_bar(figure: Figure, place: tuple[float, float, float, float], top: flo
 
 
 def bias_picture(
-    reward_bias: np.ndarray, grid: GridWorld | None = None, title: str = "", max_px: int = MAX_PX
+    reward_bias: np.ndarray,
+    grid: GridWorld | None = None,
+    title: str = "",
+    max_px: int = MAX_PX,
+    names: Names = NUMBERS,
 ) -> np.ndarray:
     """delta(s,a) [S, A], reward: a grid tile shows each action's value on the side it points to."""
     label = "delta(s,a), reward"
     if grid is None:
-        return table_picture(reward_bias, title, label, max_px)
+        return table_picture(reward_bias, title, label, max_px, names)
     figure, axes = _grid_axes(grid, title, max_px, bar=True)
     row, col = np.divmod(np.arange(grid.tiles.size), grid.shape[1])
     centre = np.stack([col, row], 1)[:, None, None, :]  # [S, 1, 1, 2]

@@ -1,8 +1,8 @@
 """Collecting a stream of tuples under a behaviour policy.
 
 A TabularMDP, or an environment of this package that follows one, is sampled in a compiled loop, this package's
-control tasks in batches; any other Gymnasium environment with Discrete spaces, or vector of environments, is taken
-through ``env.step``.
+control tasks in batches; any other Gymnasium environment with finite spaces, or vector of environments, is taken
+through ``env.step``. States and actions are numbered as ``erl_torch.Labels.of_space`` does.
 
 a' is always a draw from the prior at s'. When the behaviour policy is the prior, a' is also the action
 taken next (the paper's stream); otherwise it is a draw of its own.
@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from erl_torch import checks
+from erl_torch.envs.encoded import encoded
 from erl_torch.experience.play import Plan, tuples, vector_tuples
 from erl_torch.experience.recording import FileRecording, read_experience, write_chunks
 from erl_torch.experience.sampling import Sampler
@@ -87,7 +88,7 @@ def collect(
     """Collect experience, in memory or in a directory of columns.
 
     Args:
-        source: a TabularMDP, or a Gymnasium environment or vector environment with Discrete spaces.
+        source: a TabularMDP, or a Gymnasium environment or vector environment with finite spaces.
         n_episodes, episode_length: whole numbers >= 1. A TabularMDP gives exactly their product in tuples, as does a
             vector environment, which ends its episodes itself; an environment's own ends make episodes shorter.
         seed: a whole number, or the streams of one.
@@ -103,7 +104,7 @@ def collect(
         The tuples; with ``save_to``, what ``read_experience`` reads from there.
 
     Raises:
-        InputError: an argument out of range, spaces that are not Discrete, tuples that do not fit the memory or the
+        InputError: an argument out of range, spaces that are not finite, tuples that do not fit the memory or the
             disk, a directory that holds anything but columns, a policy that takes an action that a state does not have,
             or masks that differ between two visits of a state.
     """
@@ -147,6 +148,7 @@ def _stream(
     """
     n_episodes = checks.at_least("n_episodes", n_episodes, 1)
     episode_length = checks.at_least("episode_length", episode_length, 1)
+    source = encoded(source)
     n_states, n_actions = sizes(source)
     mdp = known_mdp(source)
     prior = check_policy("prior_policy", prior_policy, n_states, n_actions, None if mdp is None else mdp.allowed)

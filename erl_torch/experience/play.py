@@ -1,7 +1,8 @@
 """Environments taken through ``env.step``: to evaluate a policy, to show it, or to collect tuples.
 
 ``episode`` steps an environment, for each of these purposes; ``tuples`` makes a stream of its steps. ``vector_tuples``
-steps a vector of environments.
+steps a vector of environments. Whatever an environment returns is checked here: ``InputError`` names the environment
+and the step.
 
 Where ``reset`` and ``step`` tell the actions that a state has (``info["action_mask"]``, as Gymnasium's Taxi), no other
 is ever taken: a policy is taken on those that are left, with their shares.
@@ -9,6 +10,9 @@ is ever taken: a policy is taken on those that are left, with their shares.
 
 from __future__ import annotations
 
+import contextlib
+import itertools
+import numbers
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
@@ -18,10 +22,15 @@ from gymnasium.vector import AutoresetMode
 
 from erl_torch.checks import InputError
 from erl_torch.experience.transitions import Transitions
+from erl_torch.labels import Labels
 from erl_torch.mdp.masks import ActionMasks
 from erl_torch.rng import Streams
 
 CHUNK = 10_000  # tuples
+BETWEEN = ("gymnasium.wrappers", "gymnasium.core", "gymnasium.vector", "gymnasium.utils.passive_env")
+RESET = "(observation, info), info a dict"
+STEP = "(observation, reward, terminated, truncated, info)"
+INTERFACE = f"one of Gymnasium's: reset(seed=None, options=None) -> (observation, info), step(action) -> {STEP}"
 
 
 class Step(NamedTuple):
@@ -93,8 +102,9 @@ class Plan(NamedTuple):
 
 def reset(env: gym.Env[Any, Any], rng: np.random.Generator) -> Seen:
     """Reset ``env`` with a seed drawn from ``rng``; the first state."""
-    observation, info = env.reset(seed=_seed(rng))
-    return Seen(int(observation), _mask(info, env))
+    with _blamed(env, "reset"):
+        observation, info = _observed(env.reset(seed=_seed(rng)))
+        return Seen(_state(observation, _n_states(env)), _mask(info, env))
 
 
 def episode(
@@ -103,18 +113,26 @@ def episode(
     """Step ``env`` from ``first``, the state that it was reset to, to the end of the episode.
 
     Args:
-        env: with Discrete spaces.
+        env: with Discrete spaces, from 0.
         first: its first state.
         choose: (state, the actions that it has) -> action, as ``Draws``; called once per step, just before it.
         horizon: steps at most, >= 1.
+
+    Raises:
+        InputError: the environment returns what no environment should; it names the environment and the step.
     """
+    n_states = _n_states(env)
     s, mask = first
     for t in range(1, horizon + 1):
         a = choose(s, mask)
-        observation, reward, terminated, truncated, info = env.step(a)
-        s_next, last = int(observation), bool(terminated or truncated or t == horizon)
-        mask = _mask(info, env)
-        yield Step(s, a, float(reward), s_next, bool(terminated), last, mask)
+        try:
+            s_next, r, terminated, truncated, info = _stepped(env.step(a), n_states)
+            mask = _mask(info, env)
+        except Exception as error:
+            with _blamed(env, f"step {t} of an episode"):
+                raise error
+        last = terminated or truncated or t == horizon
+        yield Step(s, a, r, s_next, terminated, last, mask)
         if last:
             return
         s = s_next
@@ -186,17 +204,18 @@ def vector_tuples(env: gym.vector.VectorEnv[Any, Any, Any], plan: Plan) -> Itera
     act = Draws(plan.behaviour, rng.behaviour, "" if plan.on_prior else "behaviour_policy")
     act_next = Draws(plan.prior, rng.behaviour)
     masks = plan.masks or ActionMasks(*plan.prior.shape)
-    observation, info = env.reset(seed=_seed(rng.environment))
-    state = np.array(observation)
-    _enter(masks, state, info, np.ones(env.num_envs, bool))
+    n_states = _n_states_of_each(env)
+    state = _reset_states(env, None, n_states, plan, masks, "reset")
     action = act.each(state, masks)
     reward = np.zeros(env.num_envs)
     restarting = np.zeros(env.num_envs, bool)  # this step is a reset: its observation a first state
     unfinished = restarting.copy()  # terminated the step before: s' is that first state
     columns, collected, given = list[tuple[np.ndarray, ...]](), 0, 0
-    while collected < n:
-        observation, stepped_reward, terminated, truncated, info = env.step(action)
-        after = np.array(observation)
+    for t in itertools.count(1):
+        if collected >= n:
+            return
+        with _blamed(env, f"step {t}"):
+            after, stepped_reward, terminated, truncated, info = _all_stepped(env.step(action), n_states, env.num_envs)
         reward = np.where(restarting, reward, stepped_reward)
         terminated, truncated = terminated & ~restarting, truncated & ~restarting
         over = terminated | truncated
@@ -205,12 +224,12 @@ def vector_tuples(env: gym.vector.VectorEnv[Any, Any, Any], plan: Plan) -> Itera
         _enter(masks, after, info, ~terminated if mode != AutoresetMode.SAME_STEP else ~restarting)
         if over.any() and mode == AutoresetMode.SAME_STEP:
             has_first |= over
-            after[over] = [int(last) for last in info["final_obs"][over]]
-            _enter(masks, after, info.get("final_info", {}), truncated & ~terminated)
+            with _blamed(env, f"step {t}"):
+                after[over] = [_state(last, n_states) for last in info["final_obs"][over]]
+                _enter(masks, after, info.get("final_info", {}), truncated & ~terminated)
         elif over.any() and mode == AutoresetMode.DISABLED:
             has_first |= over
-            observation, info = env.reset(seed=_seed(rng.environment), options={"reset_mask": over})
-            _enter(masks, first := np.array(observation), info, over)
+            first = _reset_states(env, over, n_states, plan, masks, f"reset after step {t}")
         ready = (~restarting & (~terminated | has_first)) | unfinished
         after = np.where((terminated & has_first) | unfinished, first, after)
         action_next = act_next.each(after, masks)
@@ -229,6 +248,23 @@ def vector_tuples(env: gym.vector.VectorEnv[Any, Any, Any], plan: Plan) -> Itera
         state, action = np.where(restarting, held_state, state), np.where(restarting, held_action, action)
 
 
+def _reset_states(
+    env: gym.vector.VectorEnv[Any, Any, Any],
+    over: np.ndarray | None,
+    n_states: int,
+    plan: Plan,
+    masks: ActionMasks,
+    when: str,
+) -> np.ndarray:
+    """Reset those of the environments whose episode is ``over`` [n], None all; the states of all, [n]."""
+    options = None if over is None else {"reset_mask": over}
+    with _blamed(env, when):
+        observation, info = _observed(env.reset(seed=_seed(plan.rng.environment), options=options))
+        states = _states(observation, n_states, env.num_envs)
+        _enter(masks, states, info, np.ones(env.num_envs, bool) if over is None else over)
+    return states
+
+
 def _enter(masks: ActionMasks, states: np.ndarray, info: Any, which: np.ndarray) -> None:
     """Note the actions of those of ``states`` [n] that ``which`` [n] has, where ``info`` of a vector tells them."""
     given = info.get("action_mask") if isinstance(info, dict) else None
@@ -243,3 +279,129 @@ def _enter(masks: ActionMasks, states: np.ndarray, info: Any, which: np.ndarray)
 
 def _seed(rng: np.random.Generator) -> int:
     return int(rng.integers(2**31))
+
+
+# -- what environments return -----------------------------------------------------------------------------
+
+
+def _n_states(env: gym.Env[Any, Any]) -> int:
+    space = env.observation_space
+    assert isinstance(space, gym.spaces.Discrete)
+    return int(space.n)
+
+
+def _observed(result: Any) -> tuple[Any, dict[str, Any]]:
+    """What ``reset`` returned: observation and info. Raises InputError."""
+    if not (_length_is(result, 2) and isinstance(result[1], dict)):
+        raise InputError("what it returned", _short(result), RESET)
+    return result[0], result[1]
+
+
+def _parts(result: Any) -> Any:
+    """The five parts of what ``step`` returned. Raises InputError."""
+    if not _length_is(result, 5):
+        old = ": old environments' (observation, reward, done, info) does not tell the two ends apart"
+        raise InputError("what it returned", _short(result), STEP + old * _length_is(result, 4))
+    return result
+
+
+def _stepped(result: Any, n_states: int) -> tuple[int, float, bool, bool, dict[str, Any]]:
+    """What ``step`` returned, checked, the observation as a state. Raises InputError."""
+    observation, reward, terminated, truncated, info = _parts(result)
+    return (
+        _state(observation, n_states),
+        _reward(reward),
+        _flag("terminated", terminated),
+        _flag("truncated", truncated),
+        info,
+    )
+
+
+def _state(observation: Any, n_states: int) -> int:
+    """A whole number in [0, ``n_states``), which a float may be too (1.0). Raises InputError."""
+    if isinstance(observation, (int, np.integer)) and 0 <= observation < n_states:
+        return int(observation)
+    return Labels.of_space(gym.spaces.Discrete(n_states)).encode(observation, "observation")
+
+
+def _reward(reward: Any) -> float:
+    if not isinstance(reward, (numbers.Real, np.bool_)) and not (isinstance(reward, np.ndarray) and reward.ndim == 0):
+        raise InputError("reward", f"{_short(reward)} ({type(reward).__name__})", "a number")
+    try:
+        r = float(reward)
+    except (TypeError, ValueError) as error:
+        raise InputError("reward", _short(reward), "a number") from error
+    if not np.isfinite(r):
+        raise InputError("reward", r, "finite")
+    return r
+
+
+def _flag(name: str, value: Any) -> bool:
+    if not isinstance(value, (bool, np.bool_)):
+        raise InputError(name, f"{_short(value)} ({type(value).__name__})", "True or False")
+    return bool(value)
+
+
+def _length_is(result: Any, n: int) -> bool:
+    return isinstance(result, tuple) and len(result) == n
+
+
+def _short(value: Any) -> str:
+    return f"({', '.join(map(_short, value))})" if isinstance(value, tuple) else " ".join(repr(value).split())
+
+
+def _name(env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]) -> str:
+    return env.spec.id if env.spec is not None else type(env.unwrapped).__name__
+
+
+@contextlib.contextmanager
+def _blamed(env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any], when: str) -> Iterator[None]:
+    """Complaints raised inside name the environment and ``when``.
+
+    So do those of Gymnasium's own wrappers, which stand between and take what the environment returns apart.
+    """
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{_name(env)}, {when}: {error.key}", error.value, error.allowed) from error
+    except (AssertionError, ValueError, TypeError) as error:
+        trace = error.__traceback__
+        while trace is not None and trace.tb_next is not None:
+            trace = trace.tb_next
+        place = "" if trace is None else str(trace.tb_frame.f_globals.get("__name__"))
+        old = "unexpected keyword argument" in str(error) and when == "reset"
+        if not old and not place.startswith(BETWEEN):
+            raise
+        cause = " ".join(str(error).split())
+        kind = type(env.unwrapped).__name__
+        raise InputError(f"{_name(env)}, {when}: class", kind, f"{INTERFACE} ({cause})") from error
+
+
+def _n_states_of_each(env: gym.vector.VectorEnv[Any, Any, Any]) -> int:
+    space = env.single_observation_space
+    assert isinstance(space, gym.spaces.Discrete)
+    return int(space.n)
+
+
+def _all_stepped(result: Any, n_states: int, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Any]:
+    """As ``_stepped``, of a vector of ``n`` environments, and the info. Raises InputError that names the first."""
+    observation, reward, terminated, truncated, info = _parts(result)
+    states = _states(observation, n_states, n)
+    rewards = np.asarray(reward)
+    if rewards.shape != (n,) or rewards.dtype.kind not in "iufb":
+        raise InputError("reward", f"{rewards.dtype} of shape {rewards.shape}", f"numbers, of shape ({n},)")
+    rewards = rewards.astype(np.float64)
+    if not np.isfinite(rewards).all():
+        i = int(np.argmin(np.isfinite(rewards)))
+        raise InputError(f"reward[{i}]", rewards[i], "finite")
+    flags = []
+    for name, values in (("terminated", np.asarray(terminated)), ("truncated", np.asarray(truncated))):
+        if values.shape != (n,) or values.dtype.kind != "b":
+            raise InputError(name, f"{values.dtype} of shape {values.shape}", f"True or False, of shape ({n},)")
+        flags.append(values)
+    return states, rewards, flags[0], flags[1], info
+
+
+def _states(observation: Any, n_states: int, n: int) -> np.ndarray:
+    """[N] int64, as a copy. Raises InputError, with the number of the environment."""
+    return Labels.of_space(gym.spaces.Discrete(n_states)).encode_batch(observation, n, "observation")

@@ -98,6 +98,7 @@ class FileRecording:
         self._n = self.n_skipped = 0
         self.first_skipped = ""
         self._counted = False
+        self._stamp = _stamp(self.path)
         running = Checksum()
         for block in self._read(min(chunk, READ)):
             self._n += len(block)
@@ -125,14 +126,21 @@ class FileRecording:
     def chunks(self, multiple: int = 1) -> Iterator[Transitions]:
         """Make one pass, as ``Experience`` says. Raises InputError for a file that is no longer what it was."""
         n = 0
+        self._check_stamp()
         for block in regroup(self._read(max(1, min(self._chunk, READ) // multiple) * multiple), multiple):
             n += len(block)
             yield block
         if n != self._n:
             raise InputError(f"path={self.path}", f"{n} tuples", f"left as it was while it is read: {self._n} tuples")
+        self._check_stamp()
 
     def checksum(self) -> int:
         return self._checksum
+
+    def _check_stamp(self) -> None:
+        """Raise InputError where a file has another size or time of change than when it was opened."""
+        if _stamp(self.path) != self._stamp:
+            raise InputError("path", self.path, "left as it was while it is learnt from: it has been written to")
 
     def load(self) -> Transitions:
         """All its tuples, in memory."""
@@ -208,6 +216,13 @@ def _reader(path: Recordable, options: Options, format: Format | None) -> Reader
     if claimant is None:
         raise InputError("path", path, ALLOWED if format is None else "claimed by the given format")
     return claimant.reader(str(path), options)
+
+
+def _stamp(path: str) -> list[tuple[str, int, int]]:
+    """(name, size, time of change in ns) of the file, or of those in the directory; nothing of what is neither."""
+    root = Path(path)
+    files = sorted(root.rglob("*")) if root.is_dir() else [root]
+    return [(str(one), one.stat().st_size, one.stat().st_mtime_ns) for one in files if one.is_file()]
 
 
 def read_experience(

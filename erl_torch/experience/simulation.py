@@ -51,8 +51,11 @@ class Simulation:
             sizes = self.mdp.n_states, self.mdp.n_actions
             behaviour = check_policy("behaviour_policy", self.behaviour_policy, *sizes, self.mdp.allowed)
             object.__setattr__(self, "behaviour_policy", behaviour)
-        for seed in checks.sequence("seeds", self.seeds):
+        seeds = checks.sequence("seeds", self.seeds)
+        for seed in seeds:
             checks.at_least("seeds", seed, 0)
+        if not isinstance(self.seeds, Sequence):
+            object.__setattr__(self, "seeds", seeds)  # an iterator is empty by now
 
     @property
     def n_tuples(self) -> int:

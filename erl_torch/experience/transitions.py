@@ -7,12 +7,14 @@ import zlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.files import read_npz, write_npz
+from erl_torch.labels import Labels
 
 COLUMNS = ("s", "a", "r", "s_next", "a_next")
 TYPES = {name: np.dtype("<f8" if name == "r" else "<i4") for name in COLUMNS}  # in files
@@ -48,6 +50,38 @@ class Transitions:
                 raise InputError("columns", f"lengths {lengths}", "of one length")
         if len(self) == 0:
             raise InputError("transitions", "0 tuples", "at least one tuple")
+
+    @classmethod
+    def of_labels(
+        cls,
+        s: Iterable[object],
+        a: Iterable[object],
+        r: Iterable[float],
+        s_next: Iterable[object],
+        a_next: Iterable[object],
+        states: Labels | None = None,
+        actions: Labels | None = None,
+    ) -> Labelled:
+        """Make them of columns [N] of labels, as ``erl_torch.Labels``: whole numbers, texts, tuples.
+
+        Args:
+            states, actions: labels that are known; None: those met, in the order in which they first appear, row by row
+                and s, a before s', a'.
+
+        Raises:
+            InputError: no label, or one that is not known; the message names column and row.
+        """
+        labels = {"s": states, "a": actions}
+        columns = {name: _label_column(value) for name, value in zip(COLUMNS, (s, a, r, s_next, a_next), strict=True)}
+        for name, known in labels.items():
+            if known is None:
+                both = zip(columns[name], columns[f"{name}_next"], strict=False)
+                labels[name] = Labels.of_values(label for pair in both for label in pair)
+        for name in ("s", "a", "s_next", "a_next"):
+            own = labels[name[0]]
+            assert own is not None
+            columns[name] = own.encode_all(columns[name], name)
+        return Labelled(cls(**columns), labels["s"], labels["a"])  # type: ignore[arg-type]
 
     def __len__(self) -> int:
         return len(self.s)
@@ -106,6 +140,19 @@ class Transitions:
             return cls(**{name: arrays[name] for name in COLUMNS})
         except InputError as error:
             raise error.of_file(path) from error
+
+
+class Labelled(NamedTuple):
+    """Tuples, and what their states and actions are called."""
+
+    transitions: Transitions
+    states: Labels
+    actions: Labels
+
+
+def _label_column(value: Any) -> Any:
+    """A column that can be gone through more than once."""
+    return value if isinstance(value, np.ndarray) else list(value)
 
 
 class Checksum:

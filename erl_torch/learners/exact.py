@@ -182,7 +182,8 @@ class Exact:
         problem = BellmanProblem.of(mdp, self.beta, self.prior_policy)
         prior = check_prior("prior_policy", self.prior_policy, mdp.n_states, mdp.n_actions, mdp.allowed)
         if not len(state.value):  # no iteration could be made
-            return reducible_solution(mdp, problem, prior)
+            none = reducible_solution(mdp, problem, prior)
+            return none if failure is None else replace(none, status=Status.STOPPED, message="")
         below = [i for i, row in enumerate(history) if row["kl_max"] < KL_TOLERANCE]
         k = below[0] if below and self.method == "biasing" else None
         value, bounds = state.value, state.theta_bounds

@@ -148,6 +148,17 @@ class TabularLearner(Learner[S, Experience, Solution], Protocol[S]):
         """``start``, of these sizes."""
 
 
+CONTRACT = tuple(
+    dict.fromkeys(
+        name
+        for kind in (Learner, TabularLearner)
+        for name in {**vars(kind), **kind.__annotations__}
+        if not name.startswith("_")
+    )
+)
+"""Names of all that a learner of tables has."""
+
+
 class StreamLearner(ABC, Generic[T, Prepared]):
     """A learner that streams tuples in epochs: a subclass has ``init``, ``prepare``, ``step``, ``finished`` and
     ``solution``."""

@@ -42,7 +42,7 @@ from erl_torch.learners.s1.lanes import LanesState, can_interleave, interleave
 from erl_torch.learners.together import Together, check_learner
 from erl_torch.mdp.tabular import check_policy
 from erl_torch.problem import Problem
-from erl_torch.solution import Solution
+from erl_torch.solution import LABELS, Solution
 
 
 class ReplicaState(Protocol):
@@ -66,6 +66,9 @@ class ReplicaState(Protocol):
 
     def replica(self, r: int) -> StreamState:
         """The state of one replica, as its own learner would have it."""
+
+    def epochs(self, r: int, n: int) -> int:
+        """The good epochs of one replica, where the run has made ``n``."""
 
     def milestone(self, learners: Sequence[StreamLearner[Any, Any]]) -> str:
         """The milestone of the replicas that reached one in the last epoch; "" if none did."""
@@ -91,6 +94,8 @@ class ReplicaSolution:
         if name not in {f.name for f in fields(Solution)}:
             raise AttributeError(name)
         values = [getattr(solution, name) for solution in self.solutions]
+        if name in LABELS:  # which all share
+            return values[0]
         if isinstance(values[0], torch.Tensor):
             return torch.stack(values)
         if isinstance(values[0], float):
@@ -100,24 +105,26 @@ class ReplicaSolution:
     def save(self, path: str | os.PathLike[str], more: Mapping[str, np.ndarray] | None = None) -> Path:
         """Write all solutions to one npz file: the arrays of ``Solution.save`` with a leading axis [R], and ``more``.
 
-        Histories stay out: they end where their replica did.
+        Histories stay out: they end where their replica did. Labels, which all share, are there once.
         """
         rows = [solution.arrays(history=False) for solution in self.solutions]
+        shared = {name: rows[0].pop(name) for name in LABELS if name in rows[0]}
         names = {name for row in rows for name in row}
         whole = {name: np.stack([row[name] for row in rows]) for name in sorted(names) if all(name in r for r in rows)}
-        return write_npz(path, whole | dict(more or {}))
+        return write_npz(path, whole | shared | dict(more or {}))
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> ReplicaSolution:
         """Read what ``save`` wrote. Raises InputError naming the file."""
         arrays = read_npz(path)
-        known = [f.name for f in fields(Solution) if f.name in arrays]
+        shared = {name: arrays[name] for name in LABELS if name in arrays}
+        known = [f.name for f in fields(Solution) if f.name in arrays and f.name not in shared]
         if "policy" not in known:
             raise InputError("path", path, "the solutions of replicas as ReplicaSolution.save writes them")
         n = {len(arrays[name]) if arrays[name].ndim else -1 for name in known}
         if len(n) > 1 or -1 in n:
             raise InputError("path", path, "the solutions of replicas, as many rows in every array")
-        rows = ({name: arrays[name][r] for name in known} for r in range(n.pop()))
+        rows = ({name: arrays[name][r] for name in known} | shared for r in range(n.pop()))
         return cls(tuple(Solution.of_arrays(row, path) for row in rows))
 
 
@@ -206,12 +213,12 @@ class Replicas(Together):
         states: list[StreamState] = []
         before: list[object] = []
         for learner in self.learners:
-            settings = [*vars(learner).values()]
+            settings = [getattr(learner, field.name) for field in fields(learner)]
             # A state is a value: neighbours of the same settings share theirs.
             same = states and all(one is other for one, other in zip(settings, before, strict=True))
             states.append(states[-1] if same else learner.start(problem))
             before = settings
-        return EachState(tuple(states), {})
+        return EachState(tuple(states), {}, made=(0,) * len(states))
 
     def run(
         self, problem: Problem, experience: ReplicaExperience | None, state: ReplicaState | None = None
@@ -252,13 +259,9 @@ class Replicas(Together):
         """The solutions that ``state`` stands for; ``failure`` is what ended all of them."""
         solutions = []
         for r, learner in enumerate(self.learners):
-            own = state.replica(r)
-            rows: list[dict[str, float]] = []
-            for row in history:
-                if row["n_tuples"][r] == (rows[-1]["n_tuples"] if rows else 0):
-                    break  # it had stopped before
-                rows.append({name: values[r].item() for name, values in row.items()})
-            solutions.append(learner.solution(own, rows, state.failures.get(r, failure)))
+            made = history[: state.epochs(r, len(history))]
+            rows = [{name: values[r].item() for name, values in row.items()} for row in made]
+            solutions.append(learner.solution(state.replica(r), rows, state.failures.get(r, failure)))
         return ReplicaSolution(tuple(solutions), state.failures)
 
     def permitted(
@@ -316,6 +319,7 @@ class EachState:
     states: tuple[StreamState, ...]
     failures: Mapping[int, NonFiniteError]
     stepped: tuple[int, ...] = ()  # the replicas that this epoch was of
+    made: tuple[int, ...] = ()  # epochs, of each replica
 
     @property
     def n_tuples(self) -> int:
@@ -331,6 +335,9 @@ class EachState:
 
     def replica(self, r: int) -> StreamState:
         return self.states[r]
+
+    def epochs(self, r: int, n: int) -> int:
+        return self.made[r]
 
     def milestone(self, learners: Sequence[StreamLearner[Any, Any]]) -> str:
         ended = [r for r in self.stepped if r not in self.failures and learners[r].milestone(self.states[r])]
@@ -350,6 +357,7 @@ def each(
     hold = fits(experience, len(replicas), learners[0].stream_bytes)
     states = list(state.states) if state else [learner.init(n_states, n_actions) for learner in learners]
     failures = dict(state.failures) if state else {}
+    made = list(state.made) if state else [0] * len(learners)
 
     def go_on(r: int) -> StreamState | NonFiniteError:
         try:
@@ -369,4 +377,5 @@ def each(
                     failures[r] = after
                 else:
                     states[r] = after
-            yield EachState(tuple(states), dict(failures), tuple(live))
+                    made[r] += 1
+            yield EachState(tuple(states), dict(failures), tuple(live), tuple(made))

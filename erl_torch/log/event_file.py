@@ -6,6 +6,7 @@ twice, and a run has one file, however often it was killed.
 
 from __future__ import annotations
 
+import fnmatch
 import os
 import socket
 import struct
@@ -16,6 +17,8 @@ from pathlib import Path
 from tensorboard.compat.proto.event_pb2 import Event
 from tensorboard.compat.proto.summary_pb2 import Summary
 from tensorboard.summary.writer.record_writer import RecordWriter
+
+from erl_torch.checks import InputError
 
 PATTERN = "events.out.tfevents.*"
 HEAD, TAIL = 12, 4  # bytes about a record: its length with a checksum, and the checksum of its content
@@ -31,6 +34,9 @@ class EventFile:
         mark: as ``mark`` gave it, to go on from there; None begins a file beside those that are there. Of a file that
             has become shorter the whole records are kept, and one that is gone is begun, with a warning.
 
+    Raises:
+        InputError: a mark of a file that is none of TensorBoard's in ``directory``.
+
     ``fresh`` is whether the file has been begun.
     """
 
@@ -38,6 +44,8 @@ class EventFile:
         directory = Path(directory)
         directory.mkdir(parents=True, exist_ok=True)
         name, size = mark or (f"events.out.tfevents.{int(time.time())}.{socket.gethostname()}.{os.getpid()}", 0)
+        if Path(name).name != name or not fnmatch.fnmatchcase(name, PATTERN):
+            raise InputError("checkpoint: event file", name, f"of a name like {PATTERN}")  # it would be cut
         path = directory / name
         kept = size
         if mark is not None:

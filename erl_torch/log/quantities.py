@@ -246,13 +246,25 @@ QUANTITIES = (
         digits=".2f",
         row="episode return",
     ),
+    Quantity(
+        "success_rate",
+        "1",
+        "share of episodes that end, within `evaluation.horizon` steps and the environment's own limit, in an end that "
+        "is no failure (`env.failures`): exact where `return` is, else of the episodes played",
+        _FIGURE,
+        board=RETURNS,
+        chart="success rate; optimal, prior",
+        replicas=True,
+        result="success_rate",
+        digits=".4f",
+    ),
     Quantity("gap", RATE, "how far the policy's objective can be below its maximum, at most", ("Final",), result="gap"),
     Quantity("tuples_per_second", "1/s", "u updates a second of learning time", ("time",)),
     Quantity("iterations_per_second", "1/s", "`learner=exact`: iterations a second of solving time", ("time",)),
 )
 BY_NAME = {quantity.name: quantity for quantity in QUANTITIES}
 # What pictures and lines of replicas show, in their order.
-BANDS = ("theta", "delta_max", "reward_per_step", "objective", "return")
+BANDS = ("theta", "delta_max", "reward_per_step", "objective", "return", "success_rate")
 SWEEP = ("theta", "objective", "delta_max")
 PROGRESS = ("theta", "delta_max", "reward_per_step", "objective")
 

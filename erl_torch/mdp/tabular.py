@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.files import read_npz, write_npz
-from erl_torch.mdp import kernels
+from erl_torch.mdp import importers, kernels
 from erl_torch.notes import note
 
 ROW_SUM_TOLERANCE = 1e-5  # rows may be given in single precision
@@ -41,8 +41,9 @@ class TabularMDP:
 
     Args:
         transition: p(s'|s, a), [S*A, S] or [S, A, S], as any array of real numbers (lists, numpy, torch). [S*A, S] may
-            be sparse (scipy, torch); repeated entries are summed.
-        reward: [S, A], reward per step; -inf where the state does not have the action.
+            be sparse (scipy, torch); repeated entries are summed. A list of sparse matrices is one [S, S] per action.
+        reward: [S, A], reward per step, -inf where the state does not have the action; or [S, A, S], r(s, a, s'), of
+            which the mean over s' is kept.
         start: [S], distribution of the first state; None is uniform.
         normalise: divide every row, and start, by its sum, even where that is far from 1.
         allowed: [S, A] bool, the actions that each state has, at least one; None is all but those with reward -inf.
@@ -64,10 +65,13 @@ class TabularMDP:
     allowed: np.ndarray = None  # type: ignore[assignment]  # [S, A], bool, read-only
 
     def __post_init__(self, normalise: bool) -> None:
-        reward = checks.array("reward", self.reward, ("n_states", "n_actions"), ANY)
+        given: object = self.transition
+        if importers.is_by_action(given):
+            given = importers.by_action("transition", given)
+        reward = checks.array("reward", _mean_reward(given, self.reward), ("n_states", "n_actions"), ANY)
         n_states, n_actions = reward.shape
         allowed = _allowed(self.allowed, reward)
-        transition = _csr(self.transition, n_states, n_actions)
+        transition = _csr(given, n_states, n_actions)
         if not allowed.all():
             reward[~allowed] = 0.0
             transition = _with_rows(transition, allowed)
@@ -151,6 +155,98 @@ class TabularMDP:
             return cls(transition, arrays["reward"], start, normalise, allowed)  # type: ignore[arg-type]
         except InputError as error:
             raise error.of_file(path) from error
+
+    @classmethod
+    def from_outcomes(
+        cls, n_states: int, n_actions: int, outcomes: importers.Outcomes, start: ArrayLike | None = None
+    ) -> TabularMDP:
+        """The MDP whose steps a function lists; the reward of a pair is the mean over them.
+
+        Args:
+            n_states, n_actions: whole numbers >= 1.
+            outcomes: (s, a) -> entries (probability, s', reward). No entry: the state does not have the action. The
+                same s' may come several times.
+            start: [S], distribution of the first state; None is uniform.
+
+        Raises:
+            InputError: an entry that is not as above, or what the constructor refuses.
+        """
+        return cls(*importers.of_outcomes(n_states, n_actions, outcomes), start)  # type: ignore[arg-type]
+
+    @classmethod
+    def from_pymdptoolbox(cls, transition: object, reward: object, start: ArrayLike | None = None) -> TabularMDP:
+        """The MDP that pymdptoolbox has as P and R, one matrix an action.
+
+        Args:
+            transition: [A, S, S], or a sequence of A matrices [S, S], dense or sparse.
+            reward: [S], [S, A], [A, S, S], or a sequence of A matrices [S, S], one of them at least sparse. Of
+                r(a, s, s') the mean over s' is kept.
+            start: [S], distribution of the first state; None is uniform.
+
+        Raises:
+            InputError: shapes that do not fit, or what the constructor refuses.
+        """
+        return cls(*importers.of_matrices(transition, reward), start)  # type: ignore[arg-type]
+
+    @classmethod
+    def from_pairs(
+        cls,
+        states: ArrayLike,
+        actions: ArrayLike,
+        transition: object,
+        reward: ArrayLike,
+        start: ArrayLike | None = None,
+    ) -> TabularMDP:
+        """The MDP of a list of state-action pairs; a pair that is not listed is one that the state does not have.
+
+        Args:
+            states, actions: [L] whole numbers >= 0, each pair once.
+            transition: [L, S], dense or sparse, p(.|s, a) of each pair.
+            reward: [L].
+            start: [S], distribution of the first state; None is uniform.
+
+        Raises:
+            InputError: shapes that do not fit, a pair that comes twice, or what the constructor refuses.
+        """
+        return cls(*importers.of_pairs(states, actions, transition, reward), start)  # type: ignore[arg-type]
+
+    @classmethod
+    def from_quantecon(cls, problem: object, start: ArrayLike | None = None) -> TabularMDP:
+        """The MDP of a ``quantecon.markov.DiscreteDP``, in either of its forms; its discount is left out.
+
+        Args:
+            problem: with R and Q, and s_indices and a_indices in the form of state-action pairs. R = -inf: the state
+                does not have the action.
+            start: [S], distribution of the first state; None is uniform.
+
+        Raises:
+            InputError: no such object, shapes that do not fit, or what the constructor refuses.
+        """
+        return cls(*importers.of_quantecon(problem), start)  # type: ignore[arg-type]
+
+    @classmethod
+    def from_prism(
+        cls,
+        transitions: str | os.PathLike[str],
+        state_rewards: str | os.PathLike[str] | None = None,
+        transition_rewards: str | os.PathLike[str] | None = None,
+        labels: str | os.PathLike[str] | None = None,
+    ) -> TabularMDP:
+        """The MDP, or Markov chain, that PRISM exports in explicit form. The choices of a state are its actions 0, 1,
+        ...
+
+        Args:
+            transitions: .tra file.
+            state_rewards: .srew file; None is no such reward. It is paid whatever the action.
+            transition_rewards: .trew file; None is no such reward. Of r(s, a, s') the mean over s' is kept.
+            labels: .lab file; its states "init" are the start. None is a uniform start.
+
+        Raises:
+            InputError: a file that cannot be read, or what the constructor refuses (a state without a choice, say).
+        """
+        transition, reward = importers.of_prism(transitions, state_rewards, transition_rewards)
+        start = None if labels is None else importers.prism_start(labels, len(reward))
+        return cls(transition, reward, start)  # type: ignore[arg-type]
 
 
 def uniform(allowed: np.ndarray) -> np.ndarray:
@@ -244,6 +340,17 @@ def _csr(value: object, n_states: int, n_actions: int) -> sp.csr_array:
         hint += f" or [{n_states}, {n_actions}, {n_states}] ([S, A, S])"
     hint += f", as reward is [{n_states}, {n_actions}] ([S, A]): one of the two is wrong"
     return checks.sparse("transition", value, shape, hint)
+
+
+def _mean_reward(transition: object, reward: object) -> object:
+    """``reward``; of r(s, a, s') [S, A, S] the mean over s' where ``transition`` has the shape for it."""
+    if checks.is_sparse(reward):
+        return reward
+    table = checks.real("reward", reward)
+    if table.ndim != 3 or table.shape[0] != table.shape[2]:
+        return table
+    n_states, n_actions, _ = table.shape
+    return importers.mean_reward(_csr(transition, n_states, n_actions), table).reshape(n_states, n_actions)
 
 
 def _allowed(given: ArrayLike | None, reward: np.ndarray) -> np.ndarray:

@@ -18,6 +18,8 @@ from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.envs import ENTRY_POINTS
 from erl_torch.envs.discretise import Discretise
+from erl_torch.envs.encoded import encoded, labels_of
+from erl_torch.envs.ends import EndReward
 from erl_torch.envs.estimate import estimate_mdp
 from erl_torch.experience.collect import COLUMN_BYTES
 from erl_torch.experience.experience import EXPERIENCE, Experience
@@ -27,13 +29,25 @@ from erl_torch.experience.simulation import KEEP_BYTES, TUPLE_BYTES, ReplicaExpe
 from erl_torch.experience.sources import Recorded, Source
 from erl_torch.experience.transitions import Transitions, join
 from erl_torch.files import read_npy
-from erl_torch.learners.learner import Learner, TabularLearner, with_prior
-from erl_torch.mdp.from_gymnasium import MeanRewardWarning, absorbing, has_table, known_mdp, sizes, tabular_mdp
+from erl_torch.learners.learner import CONTRACT, TabularLearner, with_prior
+from erl_torch.mdp.ends import EndRule, Failures
+from erl_torch.mdp.from_gymnasium import (
+    MeanRewardWarning,
+    absorbing,
+    best_end,
+    ending_states,
+    has_table,
+    known_mdp,
+    model_ends,
+    sizes,
+    tabular_mdp,
+)
 from erl_torch.mdp.masks import ActionMasks
 from erl_torch.mdp.tabular import TabularMDP, check_policy
 from erl_torch.notes import note
 from erl_torch.problem import Problem
-from erl_torch.run.classes import OF_EVERY_ENV, parameters, resolve, settings_of
+from erl_torch.run.classes import KEYS_OF_ENV, OF_EVERY_ENV, imported, parameters, resolve, settings_of
+from erl_torch.solvers.charge import smallest_charge
 
 SafePoint = Callable[[], None]
 TABLES = 8  # of a learner's size, about, while it learns and is evaluated
@@ -42,8 +56,7 @@ LABELS = ("class", "name")  # keys of every group that are no arguments
 OF_THE_MODEL = ("stream", "n_samples", "model_seed")  # of a control task
 NO_ENV = "none"  # in the place of Gymnasium's id
 OF_A_LOG = (*LABELS, "id", "suggest", "unseen_actions")
-OF_NO_ENV = (*LABELS, "id", "suggest", *OF_THE_MODEL, *OF_EVERY_ENV)
-CONTRACT = [name for name in {**vars(Learner), **Learner.__annotations__} if not name.startswith("_")]
+OF_NO_ENV = (*KEYS_OF_ENV, *OF_THE_MODEL, *OF_EVERY_ENV)
 
 
 class World(NamedTuple):
@@ -52,6 +65,8 @@ class World(NamedTuple):
     source: TabularMDP | gym.Env[Any, Any]  # of the stream
     mdp: TabularMDP | None  # the model to evaluate on, to certify with, and to solve
     episode: TabularMDP | None = None  # the model of one episode: its end is absorbed, without reward
+    success: np.ndarray | None = None  # [S, A], the probability that a step of it ends it in success
+    ends: EndRule | None = None
 
     @property
     def allowed(self) -> np.ndarray | None:
@@ -70,12 +85,19 @@ def group(name: str) -> Iterator[None]:
 
 
 def make_env(cfg: DictConfig, render_mode: str | None = None) -> gym.Env[Any, Any]:
-    """The environment of ``cfg``: its ``class``, or what Gymnasium has under its ``id``. Raises InputError."""
+    """The environment of ``cfg``: its ``class``, or what Gymnasium has under its ``id``, with both spaces Discrete.
+
+    Raises InputError.
+    """
     keys: Any = OmegaConf.to_container(cfg, resolve=True)
     with group("env"):
         kind, spec = _env_class(keys)
-        if "kwargs" in keys:
+        if kind is not None and keys.get("class") is not None:
+            named = {key: value for key, value in keys.items() if key not in KEYS_OF_ENV}
+            arguments = settings_of(named, kind, OF_NO_ENV) | (keys.get("kwargs") or {})
+        elif "kwargs" in keys:
             arguments = keys["kwargs"]
+            checks.instance("kwargs", arguments, dict, "arguments by name, as in env.kwargs.is_slippery=false")
         elif kind is None:
             arguments = {
                 key: value for key, value in keys.items() if key not in OF_NO_ENV or key in ("bins", "low", "high")
@@ -84,10 +106,13 @@ def make_env(cfg: DictConfig, render_mode: str | None = None) -> gym.Env[Any, An
             arguments = settings_of(keys, kind, OF_NO_ENV)
         if isinstance(arguments.get("wind"), str):
             arguments["wind"] = read_npy(arguments["wind"], "wind")
-        if render_mode is not None:
-            arguments["render_mode"] = render_mode
+        shown = {} if render_mode is None else {"render_mode": render_mode}
         try:
-            env = gym.make(spec, **arguments)
+            if isinstance(spec, EnvSpec):  # its arguments may have the names of gymnasium.make's own
+                spec.kwargs = arguments
+                env = gym.make(spec, **shown)
+            else:
+                env = gym.make(spec, **arguments, **shown)
         except InputError:
             raise
         except (gym.error.Error, ImportError) as error:
@@ -101,7 +126,7 @@ def make_env(cfg: DictConfig, render_mode: str | None = None) -> gym.Env[Any, An
         binning = {key: keys.get(key) for key in ("bins", "low", "high", "actions") if key not in arguments}
         if any(value is not None for value in binning.values()):
             return Discretise(env, **binning)
-        return env
+        return encoded(env)
 
 
 def _env_class(keys: dict[str, Any]) -> tuple[type | None, str | EnvSpec]:
@@ -110,6 +135,9 @@ def _env_class(keys: dict[str, Any]) -> tuple[type | None, str | EnvSpec]:
     if path is None and name is None:
         raise InputError("id", name, "given, as in env.id=FrozenLake-v1, or env.class=my_package.MyEnv")
     if path is None:
+        module, colon, _ = str(name).partition(":")
+        if colon:  # Gymnasium imports it too, and tells less where that fails
+            imported(module, "id", name, "an environment that Gymnasium has, as MODULE:ID")
         known = "kwargs" not in keys and name in ENTRY_POINTS
         creator: Any = load_env_creator(str(gym.spec(str(name)).entry_point)) if known else None
         return creator, str(name)
@@ -120,35 +148,115 @@ def _env_class(keys: dict[str, Any]) -> tuple[type | None, str | EnvSpec]:
     return kind, EnvSpec(kind.__name__, entry_point=creator)
 
 
-def make_world(cfg: DictConfig, env: gym.Env[Any, Any], safe_point: SafePoint) -> World:
-    """What there is to learn from in ``env``, as ``cfg`` says. Raises InputError."""
+def make_world(
+    cfg: DictConfig,
+    env: gym.Env[Any, Any],
+    safe_point: SafePoint,
+    beta: float | None = None,
+    prior: np.ndarray | None = None,
+) -> World:
+    """What there is to learn from in ``env``, as ``cfg`` says. ``beta`` and ``prior`` are for ``end_reward=auto``.
+
+    Raises InputError.
+    """
     if all(key in cfg for key in OF_THE_MODEL):
         return _control_world(cfg, env, safe_point)
     on_end = cfg.get("on_end", "restart")
     checks.one_of("env.on_end", on_end, ("restart", "absorb"))
     allowed = masks_of(env) if cfg.get("use_action_mask") else None
-    if known_mdp(env) is not None or not cfg.get("use_model") or not has_table(env):
-        if on_end == "absorb":
-            raise InputError("env.on_end", on_end, "restart, where there is no model (P) to read")
-        return World(env, known_mdp(env))
-    models = {}
+    with group("env"):
+        failures = _failures(cfg, env)
+        if known_mdp(env) is not None or not cfg.get("use_model") or not has_table(env):
+            if on_end == "absorb":
+                raise InputError("on_end", on_end, "restart, where there is no model (P) to read")
+            return _world_of_steps(cfg, env, failures, beta, prior)
+        end_reward = _end_reward(cfg, env, beta, prior, allowed)
+    rule_of_ends = cfg.get("failures", "default")
+    mdp = episode = None
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", MeanRewardWarning)
-        for reading in ("restart", "absorb"):
-            try:
-                models[reading] = tabular_mdp(env, reading, allowed=allowed)
-            except InputError as error:
-                if reading == on_end == "absorb":
-                    raise error.within("env") from error
-                if reading == on_end:
-                    note(f"learning from env.step, for {error}")
+        try:
+            mdp = tabular_mdp(env, on_end, allowed=allowed, end_reward=end_reward, failures=rule_of_ends)
+        except InputError as error:
+            if on_end == "absorb" or end_reward:
+                raise error.within("env") from error
+            note(f"learning from env.step, for {error}")
     for message in sorted({str(warning.message) for warning in caught}):
         note(message)
-    episode = models.get("absorb")
+    with warnings.catch_warnings(), contextlib.suppress(InputError):
+        warnings.simplefilter("ignore", MeanRewardWarning)
+        episode = tabular_mdp(env, "absorb", allowed=allowed)  # an episode is worth what the environment pays
     if episode is not None and episode.reward[absorbing(episode)].any():
         episode = None  # an end that pays for ever is no end
-    mdp = models.get(on_end)
-    return World(env if mdp is None else mdp, mdp, episode)
+    rule = None if failures is None else EndRule(failures, end_reward)
+    success = None
+    if episode is not None:
+        chances = model_ends(env, rule_of_ends)
+        success = chances.ended - chances.failed
+        success[absorbing(episode)] = 0.0
+        success = success if success.any() else None
+    return World(env if mdp is None else mdp, mdp, episode, success, rule)
+
+
+def _failures(cfg: DictConfig, env: gym.Env[Any, Any]) -> Failures | None:
+    """The rule of ``cfg`` in ``env``; None where it is the default and the environment does not tell how it ends."""
+    rule = cfg.get("failures", "default")
+    rule = rule if isinstance(rule, str) else list(rule)
+    best = best_end(env)
+    return None if rule == "default" and best is None else Failures.of(rule, best, sizes(env)[0])
+
+
+def _end_reward(
+    cfg: DictConfig,
+    env: gym.Env[Any, Any],
+    beta: float | None,
+    prior: np.ndarray | None,
+    allowed: np.ndarray | None = None,
+) -> float:
+    """The number of ``cfg``; for ``auto`` minus the smallest charge of the model of ``env``."""
+    value = cfg.get("end_reward", 0.0)
+    if value != "auto":
+        return checks.finite("end_reward", value)
+    if beta is None:
+        raise InputError("end_reward", value, "a number here, or beta given: the charge depends on it")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", MeanRewardWarning)
+        ends = model_ends(env, cfg.get("failures", "default"))
+        if not ends.failed.any():
+            raise InputError("end_reward", value, "a number: no end is a failure by this rule (env.failures)")
+        try:
+            model = tabular_mdp(env, allowed=allowed)
+            found = smallest_charge(model, ends.failed, beta, cfg.get("end_target", 1e-3), prior)
+        except InputError as error:
+            raise InputError("end_target", error.value, error.allowed) if error.key == "target" else error from error
+    note(f"end_reward=auto: {-found.charge:.9g}, at which {found.failing_rate:.3g} of the optimum's steps fail")
+    return -found.charge
+
+
+def _world_of_steps(
+    cfg: DictConfig, env: gym.Env[Any, Any], failures: Failures | None, beta: float | None, prior: np.ndarray | None
+) -> World:
+    """That of an environment without a table ``P``, or whose table is not to be used."""
+    mdp = known_mdp(env)
+    if mdp is not None:
+        ending = ending_states(env, mdp.n_states).any()
+        rule = None
+        if ending or cfg.get("end_reward", 0.0):
+            assert failures is not None
+            rule = EndRule(failures, _end_reward(cfg, env, beta, prior))
+        if rule is None or not rule.end_reward:
+            return World(env, mdp, ends=rule)
+        charged = tabular_mdp(env, end_reward=rule.end_reward, failures=cfg.get("failures", "default"))
+        return World(charged, charged, ends=rule)
+    end_reward = cfg.get("end_reward", 0.0)
+    if end_reward == "auto":
+        allowed = "a number, where there is no model (of a log: erl_torch.smallest_charge, on its counts)"
+        raise InputError("end_reward", end_reward, allowed)
+    end_reward = checks.finite("end_reward", end_reward)
+    if not end_reward:
+        return World(env, None, ends=None if failures is None else EndRule(failures))
+    source = EndReward(env, end_reward, cfg.get("failures", "default"))
+    return World(source, None, ends=source.rule)
 
 
 def masks_of(env: gym.Env[Any, Any]) -> np.ndarray:
@@ -237,7 +345,19 @@ def make_problem(cfg: DictConfig, env: gym.Env[Any, Any], world: World, learner:
     shape = sizes(env)
     prior = check_policy("learner.prior_policy", learner.prior_policy, *shape, world.allowed)
     horizon = steps_of(env, cfg.evaluation.horizon)
-    return Problem(env, world.source, prior, world.mdp, world.episode, horizon, cfg.env.name, ActionMasks(*shape))
+    return Problem(
+        env,
+        world.source,
+        prior,
+        world.mdp,
+        world.episode,
+        horizon,
+        cfg.env.name,
+        ActionMasks(*shape),
+        *labels_of(env),
+        success=world.success,
+        ends=world.ends,
+    )
 
 
 def steps_of(env: gym.Env[Any, Any], horizon: int) -> int:
@@ -342,7 +462,9 @@ def make_replica_experience(
     streams: dict[int, Transitions] = {}
     for seed in tqdm(sorted(set(seeds)), desc=source.work, unit=" streams", delay=1, leave=False, disable=None):
         with group("experience"):
-            streams[seed] = _in_memory(source(problem, seed, lambda _: safe_point()))
+            made = source(problem, seed, lambda _: safe_point())
+            checks.instance("class", made, Experience, f"a source of {EXPERIENCE}")
+            streams[seed] = _in_memory(made)
         safe_point()
     return [streams[seed] for seed in seeds]
 

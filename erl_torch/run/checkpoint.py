@@ -13,6 +13,7 @@ import hashlib
 import io
 import math
 import pickle
+import re
 import shutil
 import sys
 import time
@@ -33,12 +34,14 @@ from erl_torch.learners.learner import NonFiniteError
 from erl_torch.log.event_file import PATTERN
 from erl_torch.solution import Solution, Status
 
-FORMAT = 3  # 1 knew no settings, 2 no types of NumPy's numbers
+FORMAT = 4  # 1 knew no settings, 2 no types of NumPy's numbers, 3 not which epoch was recorded last
 KEPT = 2
 RESULTS = ("result.json", "solution.npz", "replicas.npz")
 FILES = ("settings.json", *RESULTS, "bands.png", "sweep.png", "policy.csv")  # that a run writes under names of its own
-FREE = ("threads", "checkpoint_every")  # settings that no result depends on
+# Settings that no result depends on.
+FREE = ("threads", "checkpoint_every", "keep_tuples", "experience.keep", "experience.chunk")
 COMMON = (Evaluation, NonFiniteError, Solution, Status)  # classes that any checkpoint may hold
+PLAIN = (np.dtype(np.float64), np.dtype(np.int64), np.dtype(np.bool_))  # what Python's numbers become in an array
 Content = dict[str, Any]
 
 
@@ -67,7 +70,7 @@ class Checkpoints:
     ) -> None:
         self.directory, self.every, self.device, self.key = directory, every, device, key
         self._folder = directory / "checkpoints"
-        self._settings = {key: value for key, value in _flat(settings).items() if key.split(".")[0] not in FREE}
+        self._settings = {key: value for key, value in _flat(settings).items() if key not in FREE}
         self._last = time.monotonic()
         for path in (*(directory / name for name in FILES), *self._folder.glob("*.ckpt")):
             if path.is_dir():
@@ -85,7 +88,7 @@ class Checkpoints:
         Raises InputError as ``read``; the directory is then as it was.
         """
         found = self.read(classes)
-        write_json(self.directory / "settings.json", self._settings)
+        self.write_settings()
         for leftover in (*self.directory.glob(".*.tmp"), *self._folder.glob(".*.tmp")):
             leftover.unlink(missing_ok=True)
         if self._ours and found is None:  # it repeats every record
@@ -93,6 +96,10 @@ class Checkpoints:
                 path.unlink(missing_ok=True)
         self._others = set(self.directory.glob(PATTERN))
         return found
+
+    def write_settings(self) -> None:
+        """Say in the directory what its run computes with."""
+        write_json(self.directory / "settings.json", self._settings)
 
     def read(self, classes: Iterable[type] = ()) -> Content | None:
         """The newest checkpoint that can be read; damaged ones go, with a warning.
@@ -129,7 +136,8 @@ class Checkpoints:
             yield
         except InputError:
             if not learnt():
-                for path in {self.directory / "settings.json", *self.directory.glob(PATTERN)} - self._others:
+                ours = {self.directory / "settings.json"} if not self._ours else set()
+                for path in (ours | {*self.directory.glob(PATTERN)}) - self._others:
                     path.unlink(missing_ok=True)
                 self.clear()
             raise
@@ -153,7 +161,12 @@ class Checkpoints:
         """Write ``content()`` as the checkpoint of ``step``, if it is time (or at once, ``now``)."""
         if not now and (self.every is None or time.monotonic() - self._last < self.every):
             return
-        _write(self._folder / f"{step:018d}.ckpt", self._settings, content())
+        found = content()
+        try:
+            encoded = encode(found)
+        except TypeError as error:
+            raise InputError("state of the learner", error, "of what a checkpoint can hold, in every epoch") from error
+        _write(self._folder / f"{step:018d}.ckpt", self._settings, encoded)
         for path in sorted(self._folder.glob("*.ckpt"))[:-KEPT]:
             path.unlink(missing_ok=True)
         self._last = time.monotonic()
@@ -163,7 +176,8 @@ class Checkpoints:
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def _compare(self, before: Mapping[str, Any]) -> None:
-        differ = sorted(key for key in {**before, **self._settings} if before.get(key) != self._settings.get(key))
+        keys = {**before, **self._settings}.keys() - FREE
+        differ = sorted(key for key in keys if before.get(key) != self._settings.get(key))
         if differ:
             shown = ", ".join(f"{key}={self._settings.get(key)} (there: {before.get(key)})" for key in differ[:5])
             more = f" and {len(differ) - 5} more" if len(differ) > 5 else ""
@@ -174,7 +188,10 @@ class Checkpoints:
 def rows_of(found: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
     """What ``erl_torch.learners.learner.columns`` was given: numbers as numbers, arrays as arrays."""
     n = max((len(column) for column in found.values()), default=0)
-    plain = {name: column.tolist() if column.ndim == 1 else list(column) for name, column in found.items()}
+    plain = {
+        name: column.tolist() if column.ndim == 1 and column.dtype in PLAIN else list(column)
+        for name, column in found.items()
+    }
     return [{name: column[i] for name, column in plain.items()} for i in range(n)]
 
 
@@ -253,6 +270,8 @@ def _made(kind: Any, form: str, content: Any) -> Any:  # of ``kind``, whatever t
         return kind(content)
     if form == "named":
         return kind(**content)
+    if content.keys() != {f.name for f in fields(kind)}:
+        raise ValueError(f"{kind.__name__} has other fields than there: {', '.join(content)}")
     new = object.__new__(kind)  # as it was: nothing is computed or checked anew
     for name, item in content.items():
         object.__setattr__(new, name, item)
@@ -271,8 +290,9 @@ def check_state(state: object, classes: Iterable[type], learner: str = "its lear
 
 
 def _write(path: Path, settings: Mapping[str, Any], content: object) -> None:
+    """``content`` as ``encode`` gives it."""
     buffer = io.BytesIO()
-    torch.save({"format": FORMAT, "settings": dict(settings), "content": encode(content)}, buffer)
+    torch.save({"format": FORMAT, "settings": dict(settings), "content": content}, buffer)
     body = buffer.getvalue()
     write_bytes(path, hashlib.sha256(body).hexdigest().encode() + b"\n" + body)
 
@@ -310,6 +330,15 @@ def _json(value: object) -> object:
     if isinstance(value, (list, tuple)):
         return [_json(item) for item in value]
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def failure_of(result: Mapping[str, Any]) -> NonFiniteError | None:
+    """What a run raised whose ``result.json`` says that it left the finite numbers."""
+    if result["status"] != Status.NON_FINITE.name.lower():
+        return None
+    told = result.get("message") or next(iter(result.get("failures", {}).values()), "")
+    found = re.fullmatch(r"step (\d+): (.*)", told, re.DOTALL)
+    return NonFiniteError(int(found[1]), found[2]) if found else NonFiniteError(0, told)
 
 
 class Ended:

@@ -7,13 +7,17 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import os
+import traceback
 from collections.abc import Mapping
 from dataclasses import MISSING, fields, is_dataclass
-from typing import Any
+from types import ModuleType
+from typing import Any, TypeGuard
 
 from omegaconf import BooleanNode, DictConfig, FloatNode, IntegerNode, StringNode, ValidationError
 
 from erl_torch.checks import InputError, out_of_memory
+from erl_torch.guesses import did_you_mean
 from erl_torch.run.settings import KINDS
 
 GROUPS = ("env", "learner", "experience")  # of which a configuration can name the class
@@ -23,15 +27,18 @@ NODES: dict[str, type[FloatNode | IntegerNode | BooleanNode | StringNode]] = {
     "bool": BooleanNode,
     "str": StringNode,
 }
+OF_ENDS = {"on_end": "restart", "end_reward": 0.0, "failures": "default", "end_target": 1e-3}
 OF_EVERY_ENV = {
     "use_model": True,
     "use_action_mask": False,
-    "on_end": "restart",
+    **OF_ENDS,
     "bins": None,
     "low": None,
     "high": None,
     "actions": None,
 }
+# Keys of a run's environment: arguments of these names are given as env.kwargs.NAME.
+KEYS_OF_ENV = ("class", "name", "id", "suggest", "kwargs")
 
 
 def resolve(path: object, key: str) -> type:
@@ -40,15 +47,38 @@ def resolve(path: object, key: str) -> type:
     allowed = "the dotted name of a class, as in my_package.MyClass"
     if not module:
         raise InputError(key, path, allowed)
+    home = imported(module, key, path, allowed)
+    if not isinstance(found := getattr(home, name, None), type):
+        classes = [one for one, value in vars(home).items() if isinstance(value, type)]
+        what = "no class" if found is not None else "nothing"
+        hint = did_you_mean(name, classes, f"{module}.{{}}")
+        raise InputError(key, path, f"{allowed}: {name} is {what} of {module}{hint}")
+    return found
+
+
+def imported(module: str, key: str, value: object, allowed: str) -> ModuleType:
+    """Import ``module``. Raises InputError for ``value`` under ``key``: there is none, or why it failed."""
     try:
-        found = getattr(importlib.import_module(module), name)
+        return importlib.import_module(module)
     except (Exception, SystemExit) as error:  # of the import system, or whatever the module raises
         if out_of_memory(error):
             raise
-        raise InputError(key, path, f"{allowed} ({type(error).__name__}: {error})") from error
-    if not isinstance(found, type):
-        raise InputError(key, path, allowed)
-    return found
+        if _is_absent(error, module):
+            where = "it has to be installed, in this folder, or on PYTHONPATH"
+            raise InputError(key, value, f"{allowed}: there is no module {error.name} ({where})") from error
+        raise InputError(key, value, f"of a module that can be imported: {failure(module, error)}") from error
+
+
+def _is_absent(error: BaseException, module: str) -> TypeGuard[ModuleNotFoundError]:
+    """Whether ``error`` says that ``module``, or a package above it, is not there; not one that it imports."""
+    return isinstance(error, ModuleNotFoundError) and f"{module}.".startswith(f"{error.name}.")
+
+
+def failure(module: str, error: BaseException) -> str:
+    """Why the import of ``module`` failed, in words, with the line where it did."""
+    lines = [frame for frame in traceback.extract_tb(error.__traceback__) if "importlib" not in frame.filename]
+    at = f", {os.path.basename(lines[-1].filename)}, line {lines[-1].lineno}" if lines else ""
+    return f"{module} failed ({type(error).__name__}: {error}{at})"
 
 
 def is_own(path: object) -> bool:
@@ -86,7 +116,8 @@ def offered(group: str, path: str) -> dict[str, Any]:
         defaults |= {f.name: f.default_factory() for f in fields(kind) if f.default_factory is not MISSING and f.init}
     node: dict[str, Any] = {"class": path, "name": kind.__name__}
     if group == "env":
-        node = {"defaults": ["/schema/suggest@suggest", "_self_"], **node, **OF_EVERY_ENV}
+        node = {"defaults": ["/schema/suggest@suggest", "_self_"], **node, **OF_EVERY_ENV, "kwargs": {}}
+        defaults = {name: value for name, value in defaults.items() if name not in KEYS_OF_ENV}
     return node | {name: value for name, value in defaults.items() if _is_setting(value)}
 
 
@@ -107,7 +138,8 @@ def settings_of(values: Mapping[str, Any], kind: type, others: tuple[str, ...]) 
     takes = parameters(kind)
     for key, value in values.items():
         if key not in takes and key not in others:
-            raise InputError(key, value, f"left out: no such key; there are {', '.join(takes)}")
+            hint = did_you_mean(key, takes)
+            raise InputError(key, value, f"left out: no such key; there are {', '.join(takes)}{hint}")
     return {key: _typed(key, value, takes[key].annotation) for key, value in values.items() if key in takes}
 
 

@@ -34,9 +34,10 @@ from tqdm import tqdm
 
 from erl_torch import checks, parallel, pictures
 from erl_torch.checks import InputError
+from erl_torch.compiled import announcement
 from erl_torch.experience.collect import collect
 from erl_torch.experience.sources import Simulate
-from erl_torch.files import read_npy, write_json, write_png
+from erl_torch.files import here, read_npy, write_json, write_png
 from erl_torch.learners.learner import StreamLearner, with_prior
 from erl_torch.learners.s1 import kernels
 from erl_torch.mdp.tabular import TabularMDP, check_policy
@@ -302,9 +303,9 @@ def run_comparison(cfg: DictConfig, directory: Path, safe_point: Callable[[], No
             raise InputError("learners", name, " or ".join(n for n in map(str, cfg.learner) if n != name))
     torch.set_num_threads(1)
     if not kernels.compiled_before():
-        print("compiling the loops, about ten seconds: on the first run only", file=sys.stderr)
+        print(announcement(), file=sys.stderr)
     with collected(), contextlib.closing(make_env(cfg.env)) as env:
-        world = make_world(cfg.env, env, safe_point)
+        world = make_world(cfg.env, env, safe_point, cfg.beta)
     # The start of the stream may be another than that of the episodes; the optimum does not depend on it.
     mdp = world.source if isinstance(world.source, TabularMDP) else world.mdp
     if mdp is None:
@@ -343,9 +344,7 @@ def run_comparison(cfg: DictConfig, directory: Path, safe_point: Callable[[], No
     write_json(directory / "compare.json", result)
     title = f"{cfg.env.name}, beta {found.beta:g}: {len(found.seeds)} seeds"
     write_png(directory / "compare.png", pictures.learning_curves(result["sizes"], result["curves"], title))
-    with contextlib.suppress(ValueError):
-        directory = directory.resolve().relative_to(Path.cwd())
     print(f"\n{title}, {found.sizes[-1]:,} tuples each, theta* {found.theta:.7f}\n\n{found.table()}")
     print("\ngap: mean over seeds, interquartile mean and its interval (Student's t); other columns: means")
-    print(f"tuples: streamed, all passes together\nrun directory  {directory}")
+    print(f"tuples: streamed, all passes together\nrun directory  {here(directory)}")
     return result

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -14,9 +14,12 @@ from erl_torch.checks import InputError
 from erl_torch.learners.learner import StreamLearner
 from erl_torch.log.quantities import BANDS, BY_NAME, PROGRESS, QUANTITIES, SWEEP, Quantity, tagged
 from erl_torch.log.tensorboard import Board
+from erl_torch.run.identity import plain
 
 LOGGED = ("mean", "median", "q25", "q75", "min", "max")
-MOST_LOGGED = 24  # groups with curves of their own; all are in result.json and in the pictures
+MOST_LOGGED = (
+    24  # groups with curves of their own, on the boards and in pictures; all are in result.json and in sweep.png
+)
 
 
 @dataclass(frozen=True)
@@ -38,17 +41,21 @@ class Group:
 
 
 def setting_text(setting: object) -> str:
-    """A setting as a part of titles and tags."""
-    return f"{setting:g}" if checks.is_number(setting) else str(setting)
+    """A setting as a part of titles and tags; other numbers have other texts."""
+    if not checks.is_number(setting):
+        return str(setting)
+    short = f"{setting:g}"
+    return short if float(short) == setting else repr(setting)
 
 
-def groups_of(vary: Mapping[str, Any], n_replicas: int, settings: Mapping[str, Any]) -> list[Group]:
+def groups_of(vary: Mapping[str, Any], n_replicas: int, settings: Mapping[str, Any], beta: float) -> list[Group]:
     """Every combination of the values that vary, in their order: ``n_replicas`` of each.
 
     Args:
         vary: a number, or a list of numbers, by the setting that takes them.
         n_replicas: in each group.
         settings: those of the learner, by name.
+        beta: of the learner, where it does not vary.
 
     Raises:
         InputError: a key that is no setting of the learner, or values that are not numbers.
@@ -63,27 +70,31 @@ def groups_of(vary: Mapping[str, Any], n_replicas: int, settings: Mapping[str, A
             raise InputError(f"vary.{key}", values, "a list of numbers")
         if any(abs(value) > checks.LARGEST_INTEGER for value in column if isinstance(value, int)):
             raise InputError(f"vary.{key}", values, "whole numbers below 2**63")
+        if len(set(column)) < len(column):
+            raise InputError(f"vary.{key}", values, "values that differ (n_replicas is how many there are of each)")
         columns[key] = column
     groups = []
     for i, values in enumerate(itertools.product(*columns.values())):
         varied = dict(zip(columns, values, strict=True))
         members = slice(i * n_replicas, (i + 1) * n_replicas)
-        groups.append(Group(varied, members, float(varied.get("beta", settings["beta"]))))
+        groups.append(Group(varied, members, float(varied.get("beta", beta))))
     return groups
 
 
 def groups_among(learners: Sequence[StreamLearner[Any, Any]]) -> tuple[list[Group], dict[str, list[float]]]:
     """Learners with the same settings, in order of their first; and the values of what varies, by name."""
-    values = [{name: value for name, value in vars(one).items() if name != "prior_policy"} for one in learners]
-    names = [name for name in values[0] if any(row[name] != values[0][name] for row in values)]
-    members: dict[tuple[Any, ...], list[int]] = {}
-    for r, row in enumerate(values):
+    settings = [field.name for field in fields(learners[0]) if field.name != "prior_policy"]  # type: ignore[arg-type]
+    told = [{name: repr(plain(name, getattr(one, name))) for name in settings} for one in learners]
+    names = [name for name in settings if any(row[name] != told[0][name] for row in told)]
+    members: dict[tuple[str, ...], list[int]] = {}
+    for r, row in enumerate(told):
         members.setdefault(tuple(row[name] for name in names), []).append(r)
-    groups = [
-        Group(dict(zip(names, settings, strict=True)), np.array(rows), float(learners[rows[0]].beta))
-        for settings, rows in members.items()
-    ]
-    return groups, {name: list(dict.fromkeys(group.settings[name] for group in groups)) for name in names}
+    groups = []
+    for rows in members.values():
+        first = learners[rows[0]]
+        groups.append(Group({name: getattr(first, name) for name in names}, np.array(rows), float(first.beta)))
+    vary = {name: {told[group.members[0]][name]: group.settings[name] for group in groups} for name in names}
+    return groups, {name: list(values.values()) for name, values in vary.items()}
 
 
 def statistics(values: np.ndarray) -> dict[str, float]:

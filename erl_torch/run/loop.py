@@ -19,7 +19,9 @@ from tqdm import tqdm
 from erl_torch.checks import InputError
 from erl_torch.files import write_json
 from erl_torch.learners.learner import Learner, NonFiniteError, State, columns
-from erl_torch.log.tensorboard import Board, Boards
+from erl_torch.log.event_file import PATTERN
+from erl_torch.log.tensorboard import Board, Boards, of_sweep
+from erl_torch.notes import note
 from erl_torch.problem import Problem
 from erl_torch.run.checkpoint import Checkpoints, Content, Ended, check_state, rows_of
 from erl_torch.run.origin import texts
@@ -39,20 +41,26 @@ class Outcome(Generic[S]):
     history: list[Row] = field(default_factory=list)
     seconds: float = 0.0  # of learning
     stopped: BaseException | None = None  # what ended it before the learner was finished
+    recorded: int = 0  # epochs at the last record
 
 
 class Recorder(Protocol[S, A]):
     """What a run makes of the states of its learner: figures of their policies, records on the board, files.
 
-    A run calls ``begin`` or ``restore``, ``open``, ``record`` after epochs, ``finish``, ``save``, ``result``.
+    A run calls ``begin`` or ``restore``, then ``open`` with the ``boards``; ``record`` after epochs, and ``line`` at
+    milestones; ``mark`` after each epoch, and ``back`` where one was cut short; ``content`` for a checkpoint; at the
+    end ``finish``, ``save``, ``result``, ``summary``, ``failed``.
     """
 
     def begin(self) -> None:
         """Measure the prior policy; not called where a checkpoint is restored."""
 
     @property
-    def boards(self) -> Boards:
-        """Charts of tab Custom Scalars."""
+    def shape(self) -> tuple[int, ...]:
+        """Of a metric: () of one learner, [R] of replicas."""
+
+    def boards(self, alone: bool) -> Boards:
+        """Charts of tab Custom Scalars, of a run that is ``alone`` or a job of a sweep."""
 
     def open(self, board: Board, goes_on: bool) -> None:
         """The record of the prior policy at step 0, unless the run ``goes_on`` from a checkpoint."""
@@ -96,14 +104,15 @@ class Run(Generic[S, E, A]):
     """Everything that a run is made of.
 
     Args:
-        learner, problem: who learns, and what.
-        experience: what from; None of a learner that solves the model.
+        learner: who learns.
+        problem: what is learnt.
+        experience: what it is learnt from; None of a learner that solves the model.
         digest: a checksum of the experience, which a checkpoint must share; None where its settings tell all.
         recorder: what is made of the states.
         saved: checkpoints, of the run directory.
         hyperparameters: by name, for tab HParams.
         configuration: the settings as YAML, for tab Text.
-        every: epochs between records; milestones are always recorded.
+        every: epochs between records; milestones, and the last epoch, are always recorded.
         talks: progress bar, milestones and summary are shown.
         safe_point: called after every epoch; may raise SystemExit or KeyboardInterrupt.
         began: ``time.perf_counter()`` when the run began.
@@ -129,14 +138,15 @@ class Run(Generic[S, E, A]):
         """
         saved, recorder, learner = self.saved, self.recorder, self.learner
         outcome = Outcome(learner.start(self.problem))
-        _checked(outcome.state.metrics(), [])
+        _checked(outcome.state.metrics(), [], recorder.shape)
         if not learner.needs_model:
             check_state(outcome.state, learner.states, type(learner).__name__)
         checkpoint, began = saved.start(learner.states), self.began
         if checkpoint:
             if checkpoint["digest"] != self.digest:
                 raise InputError("experience", "another stream", "the one that the run in its directory began with")
-            outcome = Outcome(checkpoint["state"], [*rows_of(checkpoint["history"])], checkpoint["learning"])
+            rows = rows_of(checkpoint["history"])
+            outcome = Outcome(checkpoint["state"], rows, checkpoint["learning"], recorded=checkpoint["recorded"])
             recorder.restore(checkpoint)
             began -= checkpoint["seconds"]
         solution: A | None = None
@@ -145,29 +155,25 @@ class Run(Generic[S, E, A]):
             if not checkpoint:
                 recorder.begin()
             mark = checkpoint["events"] if checkpoint else None
-            with Board(saved.directory, self.hyperparameters, recorder.boards, mark) as board:
+            boards = recorder.boards(not of_sweep(saved.directory))
+            with Board(saved.directory, self.hyperparameters, boards, mark) as board:
                 if not checkpoint:
                     board.texts(texts(self.configuration, saved.directory))
                 recorder.open(board, checkpoint is not None)
-                self._learn(outcome, checkpoint is not None, board, ended, began)
+                at = self._learn(outcome, checkpoint is not None, board, ended, began)
+                learnt = self._content(outcome, board, began) | at  # before the end writes more
                 try:
+                    if len(outcome.history) > outcome.recorded:
+                        recorder.record(outcome.state, outcome.history[-1], "", board)
                     solution = learner.solution(outcome.state, outcome.history, outcome.stopped)
                     solution = recorder.finish(outcome, solution, board)
-                except BaseException as error:
-                    if solution is None or not isinstance(error, Exception):  # else what there is is written below
-                        self._keep(outcome, board, ended, began)
+                except BaseException:
+                    self._keep(outcome, ended, lambda: learnt)
                     raise
-                if isinstance(outcome.stopped, NonFiniteError) or recorder.failed(solution) is not None:
+                if isinstance(outcome.stopped, Exception) or recorder.failed(solution) is not None:
                     board.failed()
         assert solution is not None
-        outcome.stopped = outcome.stopped or ended.error
-        recorder.save(solution, saved.directory)
-        result = recorder.result(outcome, solution)
-        result["seconds"] = round(time.perf_counter() - began, 3)
-        result["notes"] = notes
-        write_json(saved.directory / "result.json", result)
-        if self.talks:
-            print(recorder.summary(result, saved.directory))
+        result = self._written(outcome, solution, ended, notes, began)
         if outcome.stopped is not None:
             raise outcome.stopped
         saved.clear()
@@ -175,14 +181,37 @@ class Run(Generic[S, E, A]):
             raise failure
         return solution, result
 
-    def _learn(self, outcome: Outcome[S], goes_on: bool, board: Board, ended: Ended, began: float) -> None:
-        """The loop. What ends it goes into ``outcome``; with nothing learnt, it is raised."""
+    def _written(
+        self, outcome: Outcome[S], solution: A, ended: Ended, notes: list[str], began: float
+    ) -> dict[str, Any]:
+        """Write the solution and ``result.json``, and show the summary; what ``result.json`` holds."""
+        recorder, saved = self.recorder, self.saved
+        outcome.stopped = outcome.stopped or ended.error
+        self._check_directory()
+        recorder.save(solution, saved.directory)
+        result = recorder.result(outcome, solution)
+        if ended.error is not None:  # it goes on from the checkpoint
+            result["status"] = "stopped"
+            result["message"] = f"{type(ended.error).__name__}: {ended.error}"
+        result["seconds"] = round(time.perf_counter() - began, 3)
+        result["notes"] = notes
+        result = _finite(result)
+        write_json(saved.directory / "result.json", result)
+        if self.talks:
+            print(recorder.summary(result, saved.directory))
+        return result
+
+    def _learn(self, outcome: Outcome[S], goes_on: bool, board: Board, ended: Ended, began: float) -> Content:
+        """The loop. What ends it goes into ``outcome``; with nothing learnt, it is raised.
+
+        Returns what a checkpoint must hold of the last epoch in the place of what there is now.
+        """
         learner, recorder = self.learner, self.recorder
 
         def reached() -> Content:
             """What an epoch leaves when all is done that belongs to it: an error may come in the midst of that."""
             own = {"state": outcome.state, "n": len(outcome.history), "learning": outcome.seconds}
-            return own | {"events": board.mark(), "recorder": recorder.mark()}
+            return own | {"events": board.mark(), "recorder": recorder.mark(), "recorded": outcome.recorded}
 
         def content() -> Content:
             return self._content(outcome, board, began)
@@ -193,12 +222,14 @@ class Run(Generic[S, E, A]):
                 bar.update(learner.work(outcome.state))
                 states = learner.run(self.problem, self.experience, outcome.state if goes_on else None)
                 for state in _timed(states, outcome):
-                    row = _checked(state.metrics(), outcome.history)
+                    row = _checked(state.metrics(), outcome.history, recorder.shape)
+                    _check_theta(row, learner.position(state))
                     outcome.state = state
                     outcome.history.append(row)
                     milestone = learner.milestone(state)
                     if milestone or len(outcome.history) % self.every == 0:
                         recorder.record(state, row, milestone, board)
+                        outcome.recorded = len(outcome.history)
                     bar.set_postfix_str(learner.progress(state), refresh=False)
                     bar.update(learner.work(state) - bar.n)
                     if milestone and self.talks:
@@ -208,14 +239,16 @@ class Run(Generic[S, E, A]):
                         self.saved.offer(learner.position(state), content)
                     self.safe_point()
         except (Exception, KeyboardInterrupt, SystemExit) as error:
-            outcome.stopped, outcome.state = error, last["state"]
+            outcome.stopped, outcome.state, outcome.recorded = error, last["state"], last["recorded"]
             del outcome.history[last["n"] :]
             recorder.back(last["recorder"])
             if not outcome.history and not isinstance(error, (NonFiniteError, KeyboardInterrupt, SystemExit)):
                 raise
+            at = {"events": last["events"], "learning": last["learning"]}
             if not isinstance(error, NonFiniteError):
-                at = {"events": last["events"], "learning": last["learning"]}
-                self._keep(outcome, board, ended, began, at)
+                self._keep(outcome, ended, lambda: content() | at)
+            return at
+        return {}
 
     def _content(self, outcome: Outcome[S], board: Board, began: float) -> Content:
         """What a checkpoint keeps."""
@@ -226,13 +259,20 @@ class Run(Generic[S, E, A]):
             "learning": outcome.seconds,
             "seconds": time.perf_counter() - began,
             "digest": self.digest,
+            "recorded": outcome.recorded,
         }
 
-    def _keep(self, outcome: Outcome[S], board: Board, ended: Ended, began: float, at: Content | None = None) -> None:
-        """A checkpoint of what is learnt, if anything is; ``at`` is what belongs to its epoch."""
+    def _keep(self, outcome: Outcome[S], ended: Ended, content: Callable[[], Content]) -> None:
+        """A checkpoint of what is learnt, if anything is."""
         if outcome.history and not self.learner.needs_model:
-            step = self.learner.position(outcome.state)
-            ended.keep(self.saved, step, lambda: self._content(outcome, board, began) | (at or {}))
+            ended.keep(self.saved, self.learner.position(outcome.state), content)
+
+    def _check_directory(self) -> None:
+        """A note where the run's directory, or its event file, was taken away while it ran."""
+        directory = self.saved.directory
+        if not any(directory.glob(PATTERN)):
+            note(f"{directory} or its event file was taken away while the run wrote to it: its records are lost")
+            self.saved.write_settings()
 
     def _bar(self) -> tqdm:
         total = self.learner.total(self.experience)
@@ -243,15 +283,32 @@ class Run(Generic[S, E, A]):
         )  # fmt: skip
 
 
-def _checked(row: Row, before: list[Row]) -> Row:
-    """``row``, if it is numbers under the names of the rows before. Raises InputError."""
+def _checked(row: Row, before: list[Row], shape: tuple[int, ...]) -> Row:
+    """``row``, if it is numbers of ``shape`` under the names of the rows before. Raises InputError."""
     for name, value in row.items():
-        if np.asarray(value).dtype.kind not in "biuf":
-            raise InputError(f"metrics of the learner, {name}", value, "a number, or one per replica")
+        dtype = np.asarray(value).dtype
+        if dtype.kind not in "biuf" or dtype.itemsize > 8 or np.shape(value) != shape:
+            allowed = f"{shape[0]} numbers, one per replica" if shape else "a number"
+            raise InputError(f"metrics of the learner, {name}", value, allowed)
     if before and row.keys() != before[0].keys():
         differ = ", ".join(sorted(row.keys() ^ before[0].keys()))
         raise InputError("metrics of the learner", differ, "the same names in every state")
     return row
+
+
+def _finite(value: Any) -> Any:  # what JSON holds
+    """``value`` with None in the place of numbers that JSON does not have."""
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def _check_theta(row: Row, position: int) -> None:
+    """Raise NonFiniteError for the theta of one learner that is no longer a number."""
+    if np.ndim(row.get("theta", 0.0)) == 0 and not np.isfinite(row.get("theta", 0.0)):
+        raise NonFiniteError(position, f"theta is {row['theta']}")
 
 
 def _timed(states: Iterator[S], outcome: Outcome[S]) -> Iterator[S]:

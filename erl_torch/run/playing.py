@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shlex
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,8 +14,10 @@ from omegaconf import DictConfig, OmegaConf
 
 from erl_torch import checks
 from erl_torch.checks import InputError
-from erl_torch.experience.play import Draws, episode, reset
+from erl_torch.envs.encoded import labels_of
+from erl_torch.experience.play import Draws, Step, episode, reset
 from erl_torch.files import write_gif
+from erl_torch.labels import Names
 from erl_torch.learners.replicas import ReplicaSolution
 from erl_torch.mdp.from_gymnasium import sizes
 from erl_torch.mdp.tabular import check_policy
@@ -65,8 +68,9 @@ def play(cfg: DictConfig) -> Played:
         modes = plain.metadata.get("render_modes") or []
     if mode not in modes and cfg.render == "gif":
         raise InputError("render", "gif", f"ansi or none: {settings.env.name} draws no pictures")
-    if mode not in modes and cfg.render == "ansi":
-        print(f"note: {settings.env.name} has no text to show" + "; render=gif draws it" * ("rgb_array" in modes))
+    plain_text = cfg.render == "ansi" and mode not in modes
+    if plain_text and "rgb_array" in modes:
+        print(f"note: {settings.env.name} has no text of its own to show; render=gif draws it")
     try:
         table = check_policy("policy", table, n_states, n_actions)
     except InputError as error:
@@ -74,7 +78,7 @@ def play(cfg: DictConfig) -> Played:
     if cfg.greedy:
         table = np.eye(n_actions)[table.argmax(1)]
     with contextlib.closing(make_env(settings.env, mode if mode in modes else None)) as env:
-        n_shown = (cfg.n_steps or SHOWN[cfg.render]) if mode in modes else 0
+        n_shown = (cfg.n_steps or SHOWN[cfg.render]) if mode in modes or plain_text else 0
         played = episodes(env, table, cfg.n_episodes, settings.evaluation.horizon, cfg.seed, n_shown)
         fps = env.metadata.get("render_fps", 10)
     head = f"{settings.env.name}, {settings.learner.name}" + ("" if cfg.replica is None else f", replica {cfg.replica}")
@@ -95,15 +99,16 @@ def _check_named(cfg: DictConfig, settings: DictConfig, run: Path) -> None:
     named = cfg.env["class"]
     if named is not None and named != kind:
         raise InputError("env.class", named, f"left out: the environment of {run} is of another class")
-    if kind is not None and not is_own(kind) and named is None:
-        allowed = f"typed as env.class={kind}: it makes the run's environment, and is imported only if you name it"
-        raise InputError("env.class", named, allowed)
     module, colon, _ = str(settings.env.get("id")).partition(":")
-    if cfg.module != (module if colon else None):
-        if colon:
-            allowed = f"typed as module={module}: it makes the run's environment, and runs only if you name it"
-            raise InputError("module", cfg.module, allowed)
-        raise InputError("module", cfg.module, f"left out: no module makes the environment of {run}")
+    wanted = [f"env.class={kind}"] * (kind is not None and not is_own(kind) and named is None)
+    wanted += [f"module={module}"] * bool(colon and cfg.module is None)
+    if wanted:
+        raise InputError(
+            "run", run, f"played with what makes its environment, which is imported: add {shlex.join(wanted)}"
+        )
+    if cfg.module is not None and cfg.module != (module if colon else None):
+        allowed = module if colon else f"left out: no module makes the environment of {run}"
+        raise InputError("module", cfg.module, allowed)
 
 
 def episodes(
@@ -111,17 +116,19 @@ def episodes(
 ) -> Played:
     """Play ``policy`` [S, A]: episodes of at most ``horizon`` steps, each with its own random stream.
 
-    ``n_shown`` steps of the first episode are rendered, in the environment's render mode.
+    ``n_shown`` steps of the first episode are rendered, in the environment's render mode; without one each is a line of
+    state, action and reward.
     """
     checks.memory("n_episodes", n_episodes, 17 * n_episodes, "the returns and lengths of all episodes")
     returns, lengths, ended = np.zeros(n_episodes), np.zeros(n_episodes, np.int64), np.zeros(n_episodes, bool)
     shown: list[Any] = []
+    names = Names(*labels_of(env))
     evaluation = streams(seed).evaluation
     for i in range(n_episodes):
         (rng,) = evaluation.spawn(1)
         first, draw = reset(env, rng), Draws(policy, rng)
         if i == 0 and n_shown:
-            shown.append(env.render())
+            shown.append(names.state(first.s) if env.render_mode is None else env.render())
             if isinstance(shown[0], np.ndarray):
                 most = min(n_shown, horizon)
                 checks.memory("n_steps", n_shown, shown[0].nbytes * most, f"{most:,} pictures")
@@ -130,8 +137,14 @@ def episodes(
             lengths[i] += 1
             ended[i] = step.terminated
             if i == 0 and lengths[0] <= n_shown:
-                shown.append(env.render())
+                shown.append(_line(step, names) if env.render_mode is None else env.render())
     return Played(returns, lengths, ended, shown)
+
+
+def _line(step: Step, names: Names) -> str:
+    """One step as text."""
+    after = names.state(step.s_next, "s'")
+    return f"{names.pair(step.s, step.a)}, r={step.r:g}, {after}{', the end' * step.terminated}"
 
 
 def find_run(name: str) -> Path:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,6 +21,7 @@ from erl_torch.experience.log import Log
 from erl_torch.experience.simulation import KEEP_BYTES, ReplicaExperience, Simulation, longest, streams_of
 from erl_torch.experience.transitions import Transitions
 from erl_torch.files import write_png
+from erl_torch.labels import NUMBERS, Names
 from erl_torch.learners.learner import NonFiniteError, StreamLearner
 from erl_torch.learners.replicas import Replicas, ReplicaSolution, ReplicaState
 from erl_torch.log.quantities import with_own
@@ -42,10 +43,22 @@ from erl_torch.run.judge import (
 )
 from erl_torch.run.loop import Outcome, Row, SafePoint
 from erl_torch.run.report import Title, ended_as, last_rows, plural, versions
+from erl_torch.run.verdict import verdict_of_replicas
 from erl_torch.solution import Status
 from erl_torch.solvers import solve_soft_bellman
 
 MOST_LETTERS = 64  # of a setting that is text, in ``replicas.npz``
+WORST_FIRST = (
+    Status.NON_FINITE,
+    Status.STOPPED,
+    Status.PSI_LIMIT,
+    Status.STEP_LIMIT,
+    Status.STAGNATED,
+    Status.REDUCIBLE,
+    Status.UNCERTIFIED,
+    Status.COMPLETED,
+    Status.CONVERGED,
+)
 FEW = 24  # replicas whose simulated streams are sampled once more, to hold theta against what they say
 
 
@@ -87,7 +100,13 @@ class ReplicaRecorder:
             _judges_of(self.problem, self.experience),
         )
         texts, self.data = reservations_of(
-            self.experience, learners, self.problem.prior, self.judges.model, self.settings.certify, self.safe_point
+            self.experience,
+            learners,
+            self.problem.prior,
+            self.judges.model,
+            self.settings.certify,
+            self.safe_point,
+            self.problem.names,
         )
         for text in texts:
             note(text)
@@ -114,7 +133,10 @@ class ReplicaRecorder:
         self.first = self.judges(np.repeat(self.problem.prior[None], len(self.replicas), axis=0), True)
 
     @property
-    def boards(self) -> Boards:
+    def shape(self) -> tuple[int, ...]:
+        return (len(self.replicas),)
+
+    def boards(self, alone: bool) -> Boards:
         metrics = self.replicas.learners[0].start(self.problem).metrics()
         optima = dict(zip((group.name for group in self.groups[:MOST_LOGGED]), self.optima, strict=False))
         return replica_layout(optima, [*metrics, *self.first], self.table)
@@ -134,9 +156,10 @@ class ReplicaRecorder:
     # -- checkpoints ----------------------------------------------------------------------------------
 
     def content(self) -> Content:
-        return {"record": self.recorded.content(), "evaluation": self.judges.generators()}
+        return {"record": self.recorded.content(), "evaluation": self.judges.generators(), "first": self.first}
 
     def restore(self, content: Content) -> None:
+        self.first = content["first"]
         self.recorded.restore(content["record"])
         self.judges.restore(content["evaluation"])
 
@@ -168,9 +191,12 @@ class ReplicaRecorder:
         rate = outcome.state.work / max(outcome.seconds, 1e-9)
         board.scalars({"time/tuples_per_second": rate}, step)
         board.scalars(self.recorded.final(), step)
+        board.texts({"answer": verdict_of_replicas(self._away(solution))})
         for text in reservations.of_replicas(self._outcomes(solution)):
             note(text)
-        return solution
+        states, actions = self.problem.names
+        named = (replace(one, state_labels=states, action_labels=actions) for one in solution.solutions)
+        return ReplicaSolution(tuple(named), solution.failures)
 
     @property
     def _n_each(self) -> int:
@@ -215,7 +241,7 @@ class ReplicaRecorder:
         return {
             "env": self.title.env,
             "learner": self.title.learner,
-            "seed": self.title.seed,
+            "seed": int(self.seeds[0]),
             "n_replicas": self._n_each,
             "vary": dict(self.vary),
             "status": Status.STOPPED.name.lower() if stopped else _status(solution),
@@ -234,19 +260,32 @@ class ReplicaRecorder:
             **({} if self.log is None else {"log": self.log.report.content()}),
         }
 
+    def _seeds_text(self) -> str:
+        """The seeds of each group, where all have the same; else all that there are."""
+        by_group = [[*np.array(self.seeds)[group.members]] for group in self.groups]
+        same = all(own == by_group[0] for own in by_group)
+        seeds = sorted(set(by_group[0] if same else self.seeds))
+        low, high = seeds[0], seeds[-1]
+        if len(seeds) == 1:
+            text = f"seed {low}"
+        elif len(seeds) == high - low + 1:
+            text = f"seeds {low} to {high}"
+        else:
+            text = f"{len(seeds)} seeds from {low} to {high}"
+        return f"{text} each" if same and len(self.groups) > 1 else text
+
     def _half_widths(self, solution: ReplicaSolution) -> dict[str, float] | None:
         """Statistics of how far each theta is from what its own stream says; None where no stream has an interval."""
-        away = [
-            reservations.half_widths(one.theta, data.estimate)
-            for one, data in zip(solution.solutions, self.data, strict=True)
-        ]
-        finite = np.array([x for x in away if np.isfinite(x)])
+        finite = np.array([x for x in self._away(solution) if np.isfinite(x)])
         return statistics(finite) | {"replicas": len(finite)} if finite.size else None
+
+    def _away(self, solution: ReplicaSolution) -> list[float]:
+        pairs = zip(solution.solutions, self.data, strict=True)
+        return [reservations.half_widths(one.theta, data.estimate) for one, data in pairs]
 
     def summary(self, result: Mapping[str, Any], directory: Path) -> str:
         name = f"{self.title.env}, {self.title.learner}"
-        last_seed = self.title.seed + self._n_each - 1
-        seeds = f"seed {self.title.seed}" if self._n_each == 1 else f"seeds {self.title.seed} to {last_seed}"
+        seeds = self._seeds_text()
         if len(self.groups) == 1:
             lines = ["", *_one_group(name, seeds, self.recorded.names, result)]
         else:
@@ -263,12 +302,8 @@ class ReplicaRecorder:
 
 
 def _status(solution: ReplicaSolution) -> str:
-    """The one that asks for most: what ended badly comes first."""
-    statuses = {one.status for one in solution.solutions}
-    for status in (Status.NON_FINITE, Status.STOPPED, Status.PSI_LIMIT, Status.STEP_LIMIT):
-        if status in statuses:
-            return status.name.lower()
-    return sorted(status.name for status in statuses)[0].lower()
+    """The worst of all replicas'."""
+    return min((one.status for one in solution.solutions), key=WORST_FIRST.index).name.lower()
 
 
 # -- what policies and streams are held against ------------------------------------------------------
@@ -317,11 +352,20 @@ class Judges:
             else Judge(self.episode, self.problem.prior, self.problem.horizon)
         )
 
+    @functools.cached_property
+    def of_success(self) -> Judge | None:
+        """Of the episodes' model with a reward of 1 for a success; None where it is not known."""
+        if self.episode is None or self.problem.success is None:
+            return None
+        return Judge(replace(self.episode, reward=self.problem.success), self.problem.prior, self.problem.horizon)
+
     def rewards(self, policy: np.ndarray) -> dict[str, float]:
         """Reward per step of a policy [S, A], and return of an episode where its model is known."""
         figures = {"reward_per_step": self.of_model.reward_per_step(policy)}
         if self.episode is not None:
             figures["return"] = self.problem.horizon * self.of_episode.reward_per_step(policy)
+        if self.of_success is not None:
+            figures["success_rate"] = self.problem.horizon * self.of_success.reward_per_step(policy)
         return figures
 
     def __call__(self, policies: np.ndarray, milestone: bool) -> dict[str, np.ndarray]:
@@ -340,6 +384,8 @@ class Judges:
                 figures["return"] = self.problem.horizon * figures["reward_per_step"]
             else:
                 figures["return"] = self.problem.horizon * each(lambda r: self.of_episode.reward_per_step(policies[r]))
+            if (succeeds := self.of_success) is not None:
+                figures["success_rate"] = self.problem.horizon * each(lambda r: succeeds.reward_per_step(policies[r]))
         elif self.problem.env is None:
             judges = self.of_data * len(policies) if len(self.of_data) == 1 else self.of_data
             figures["objective"] = np.array(
@@ -349,11 +395,14 @@ class Judges:
                 ]
             )
         elif milestone:
+            p, env = self.problem, self.problem.env
             played = [
-                evaluate(self.problem.env, policy, beta, rng, self.n_episodes, self.problem.horizon, self.problem.prior)
+                evaluate(env, policy, beta, rng, self.n_episodes, p.horizon, p.prior, ends=p.ends)
                 for policy, beta, rng in zip(policies, self.betas, self.rngs, strict=True)
             ]
             figures["return"] = np.array([one.mean_return for one in played])
+            if p.ends is not None:
+                figures["success_rate"] = np.array([one.success_rate for one in played])
             if self.model is None:
                 figures["reward_per_step"] = np.array([one.reward_per_step for one in played])
                 figures["objective"] = np.array([one.objective for one in played])
@@ -381,6 +430,7 @@ def reservations_of(
     model: TabularMDP | None,
     certify: bool,
     safe_point: SafePoint,
+    names: Names = NUMBERS,
 ) -> tuple[list[str], list[Data]]:
     """(notes on what streams do not allow the learners, what theta is to be held against); each stream is read once.
     Theta is not held against the model's."""
@@ -417,7 +467,7 @@ def reservations_of(
     held = []
     for learner, data in zip(learners, streams_of, strict=True):
         if id(data) not in counted:
-            counted[id(data)] = reservations.count(data, shape[0], shape[1], next_actions)
+            counted[id(data)] = reservations.count(data, shape[0], shape[1], next_actions, names)
         here = counted[id(data)]
         against = (
             [] if model is None else reservations.of_model(here, model) + reservations.of_states(here.tally, model)
@@ -444,7 +494,7 @@ def _one_group(first: str, seeds: str, names: Sequence[str], result: Mapping[str
 
 
 def _many_groups(first: str, seeds: str, groups: Sequence[Group], result: Mapping[str, Any]) -> Iterator[str]:
-    yield f"{first}, {len(groups)} settings, {seeds} each: {ended_as(result)}"
+    yield f"{first}, {len(groups)} settings, {seeds}: {ended_as(result)}"
     width = max(len(group.title) for group in groups) + 2
     yield f"{'':{width}}{'theta':>11}{'quartiles':>24}{'exact':>11}{'objective':>12}{'at most':>11}"
     shown = result["groups"] if len(groups) <= 40 else [*result["groups"][:20], None, *result["groups"][-19:]]

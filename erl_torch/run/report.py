@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import platform
+import shlex
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ import torch
 import erl_torch
 from erl_torch.empirical.uncertainty import Estimate
 from erl_torch.evaluation import Evaluation
+from erl_torch.files import here
 from erl_torch.log.quantities import tagged
 from erl_torch.mdp.tabular import TabularMDP
 from erl_torch.problem import Problem
@@ -44,6 +45,7 @@ def figures(measured: Evaluation) -> dict[str, float]:
         "reward_per_step": measured.reward_per_step,
         "objective": measured.objective,
     }
+    found["success_rate"] = measured.success_rate
     return {name: value for name, value in found.items() if not np.isnan(value)}
 
 
@@ -63,6 +65,8 @@ def optimal_tags(optimum: Solution | None, model: TabularMDP | None, problem: Pr
             values["reward_per_step"] = reward_per_step(model, policy, problem.horizon)
             if (episode := episode_model(problem)) is not None:
                 values["return"] = mean_return(episode, problem.horizon, policy)
+                if problem.success is not None:
+                    values["success_rate"] = success_rate(episode, problem.success, problem.horizon, policy)
     return tagged("optimal", values)
 
 
@@ -80,6 +84,11 @@ def mean_return(episode: TabularMDP, horizon: int, policy: np.ndarray) -> float:
     return horizon * reward_per_step(episode, policy, horizon)
 
 
+def success_rate(episode: TabularMDP, success: np.ndarray, horizon: int, policy: np.ndarray) -> float:
+    """Probability that an episode of at most ``horizon`` steps ends in success; ``success`` [S, A]: of each step."""
+    return horizon * reward_per_step(replace(episode, reward=success), policy, horizon)
+
+
 def versions() -> dict[str, str]:
     """Of what a result depends on."""
     return {
@@ -91,15 +100,6 @@ def versions() -> dict[str, str]:
     }
 
 
-def where(directory: Path) -> tuple[Path, Path | str]:
-    """A run directory as a user would write it, and what to give TensorBoard."""
-    with contextlib.suppress(ValueError):
-        directory = directory.resolve().relative_to(Path.cwd())
-    if directory.parent.name.startswith("sweep-"):
-        return directory, directory.parent  # its runs side by side, by short names
-    return directory, "runs" if directory.parts[0] == "runs" else directory
-
-
 def headline(heading: str, result: Mapping[str, Any]) -> list[str]:
     """The first lines of a summary."""
     return ["", f"{heading}: {ended_as(result)}"]
@@ -107,11 +107,13 @@ def headline(heading: str, result: Mapping[str, Any]) -> list[str]:
 
 def last_rows(result: Mapping[str, Any], directory: Path) -> list[str]:
     """The last rows of a summary."""
-    directory, logs = where(directory)
+    where = here(directory)
+    seconds, learning = result["seconds"], result["seconds_learning"]
+    remedy = "" if seconds < 30 or learning > seconds / 5 else "; evaluation.every=10 measures policies less often"
     return [
-        f"{'seconds':18}{result['seconds']:.1f}, of which {result['seconds_learning']:.1f} learning",
-        f"{'run directory':18}{directory}",
-        f"{'look at it':18}tensorboard --logdir {logs}",
+        f"{'seconds':18}{seconds:.1f}, of which {learning:.1f} learning{remedy}",
+        f"{'run directory':18}{where}",
+        f"{'look at it':18}tensorboard --logdir {shlex.quote(str(where))}",
         *(f"{'note':18}{text}" for text in result["notes"]),
     ]
 

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import time
 import warnings
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, fields, is_dataclass, replace
+from dataclasses import asdict, is_dataclass, replace
 from pathlib import Path
 from typing import Any, overload
 
 import gymnasium as gym
-import numpy as np
-import torch
 import yaml
 
 from erl_torch import checks
 from erl_torch.checks import InputError
+from erl_torch.envs.encoded import encoded, labels_of
 from erl_torch.envs.tabular import TabularEnv
 from erl_torch.experience.experience import EXPERIENCE, Experience, permitted
 from erl_torch.experience.log import Log
@@ -25,8 +22,7 @@ from erl_torch.experience.simulation import ReplicaExperience, Simulation, diges
 from erl_torch.experience.sources import Source
 from erl_torch.experience.transitions import Transitions
 from erl_torch.files import alone
-from erl_torch.learners.exact import Exact
-from erl_torch.learners.learner import StreamLearner, Table, TabularLearner, as_told, with_prior
+from erl_torch.learners.learner import CONTRACT, Table, TabularLearner, as_told, with_prior
 from erl_torch.learners.replicas import Replicas, ReplicaSolution
 from erl_torch.log.tensorboard import hyperparameters
 from erl_torch.mdp.from_gymnasium import known_mdp, sizes
@@ -36,8 +32,9 @@ from erl_torch.notes import Note, collected, note
 from erl_torch.problem import Problem
 from erl_torch.rng import streams
 from erl_torch.run.build import accepted, steps_of
-from erl_torch.run.checkpoint import Checkpoints
+from erl_torch.run.checkpoint import Checkpoints, failure_of
 from erl_torch.run.groups import groups_among
+from erl_torch.run.identity import environment, plain
 from erl_torch.run.judge import EvaluationSettings
 from erl_torch.run.loop import Run
 from erl_torch.run.replicas import ReplicaRecorder
@@ -46,7 +43,8 @@ from erl_torch.run.single import SingleRecorder
 from erl_torch.solution import Solution
 
 KINDS = (Simulation, list, tuple)  # of experience that replicas take besides
-Given = Problem | TabularMDP | gym.Env[Any, Any] | Log
+Known = Problem | TabularMDP | gym.Env[Any, Any]
+Given = Known | Log
 
 
 @overload
@@ -118,105 +116,123 @@ def train(
         NonFiniteError: the learner (or a replica) left the finite numbers; everything is written, up to the last good
             epoch.
     """
+    directory = Path(directory)
+    made = not directory.exists()
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        with alone(directory, "directory"):
+            notes: list[str] = []
+            try:
+                with collected(print_them=talks) as notes:
+                    given = (learner, problem, experience)
+                    return _trained(*given, directory, seed, evaluation, checkpoint_every, talks, notes)
+            finally:
+                for text in () if talks else notes:
+                    warnings.warn(text, Note, stacklevel=2)
+    except NotADirectoryError as error:
+        raise InputError("directory", directory, f"a directory, new or that of a run ({error.strerror})") from error
+    except FileExistsError as error:
+        raise InputError("directory", directory, "a directory, new or that of a run: it is a file") from error
+    finally:
+        if made and directory.is_dir() and not any(directory.iterdir()):
+            directory.rmdir()
+
+
+def _trained(
+    learner: Any,
+    problem: Given,
+    experience: Any,
+    directory: Path,
+    seed: int,
+    evaluation: EvaluationSettings | None,
+    checkpoint_every: float | None,
+    talks: bool,
+    notes: list[str],
+) -> Any:
+    """``train``, in a directory that no other run is writing to."""
     began = time.perf_counter()
     seed = checks.at_least("seed", seed, 0)
     settings = EvaluationSettings() if evaluation is None else evaluation
-    log, experience = _of_log(learner, problem, experience)
+    log, known, experience = _of_log(learner, problem, experience)
     one = _checked(learner, experience, settings, checkpoint_every)
     many = isinstance(learner, Replicas)
-    given = _problem(problem, one.prior_policy, settings.horizon)
+    given = _problem(known, one.prior_policy, settings.horizon)
     learner = with_prior(learner, given.allowed)
     learner.start(given)  # raises where the learner cannot learn this problem
     checksum = None if isinstance(experience, Source) else digest(experience)
     described = _described(learner, given, experience, seed, settings) | {"digest": checksum}
-    saved = Checkpoints(Path(directory), described, checkpoint_every, getattr(one, "device", "cpu"), "directory")
-    if saved.result() is not None:
-        return _read(saved, many)
+    saved = Checkpoints(directory, described, checkpoint_every, getattr(one, "device", "cpu"), "directory")
+    if (found := saved.result()) is not None:
+        saved.clear()
+        if (failure := failure_of(found)) is not None:
+            raise failure
+        kind, name = (ReplicaSolution, "replicas.npz") if many else (Solution, "solution.npz")
+        return kind.load(saved.directory / name)
     title = Title(given.name, described["learner"]["name"], seed)
-    with collected(print_them=talks) as notes:
-        recorder: Any
-        if many:
-            experience, seeds = _of_replicas(learner, given, experience, seed)
+    recorder: Any
+    vary: dict[str, list[Any]] = {}
+    if many:
+        experience, seeds = _of_replicas(learner, given, experience, seed)
+        learner, given = as_told(learner, given)
+        experience = learner.permitted(experience, given.n_states, given.n_actions, note)
+        learner.check(experience, given.n_states, given.n_actions)
+        groups, vary = groups_among(learner.learners)
+        recorder = ReplicaRecorder(learner, given, experience, groups, seeds, vary, settings, title, lambda: None, log)
+        n_experience = longest(experience)
+    else:
+        if isinstance(experience, Source):
+            experience = experience(given, seed, lambda _: None)
+            checks.instance("experience", experience, Experience, EXPERIENCE)
+        n_skipped = 0
+        if experience is not None:
+            experience, n_skipped = accepted(experience)
             learner, given = as_told(learner, given)
-            experience = learner.permitted(experience, given.n_states, given.n_actions, note)
-            learner.check(experience, given.n_states, given.n_actions)
-            groups, vary = groups_among(learner.learners)
-            parts = learner, given, experience, groups, seeds, vary
-            recorder = ReplicaRecorder(*parts, settings, title, lambda: None, log)
-            n_experience = longest(experience)
-        else:
-            if isinstance(experience, Source):
-                experience = experience(given, seed, lambda _: None)
-                checks.instance("experience", experience, Experience, EXPERIENCE)
-            n_skipped = 0
-            if experience is not None:
-                experience, n_skipped = accepted(experience)
-                learner, given = as_told(learner, given)
-                experience = permitted(experience, given.prior, learner.drawn_from_prior == "a_next", note)
-            rng = streams(seed).evaluation
-            recorder = SingleRecorder(learner, given, experience, settings, rng, title, n_skipped, log)
-            n_experience = 0 if experience is None else len(experience)
-        run: Run[Any, Any, Any] = Run(
-            learner=learner,
-            problem=given,
-            experience=experience,
-            digest=digest(experience) if checksum is None else checksum,
-            recorder=recorder,
-            saved=saved,
-            hyperparameters=hyperparameters(described, n_experience=n_experience),
-            configuration=yaml.safe_dump(described, sort_keys=False),
-            every=settings.every,
-            talks=talks,
-            safe_point=lambda: None,
-            began=began,
-        )
-        made = not saved.directory.exists()
-        saved.directory.mkdir(parents=True, exist_ok=True)
-        try:
-            with alone(saved.directory, "directory"):
-                solution, _ = run.perform(notes)
-        finally:
-            if made and not any(saved.directory.iterdir()):
-                saved.directory.rmdir()
-    if not talks:
-        _warn(notes)
-    return solution
+            experience = permitted(experience, given.prior, learner.drawn_from_prior == "a_next", note)
+        rng = streams(seed).evaluation
+        recorder = SingleRecorder(learner, given, experience, settings, rng, title, n_skipped, log)
+        n_experience = 0 if experience is None else len(experience)
+    # Columns of tab HParams: what varies among replicas by its name, not replica by replica.
+    own = {key: value for key, value in described["learner"].items() if key not in ("module", "replicas")}
+    shown = described | {"learner": own | {f"vary.{key}": plain(key, values, 1) for key, values in vary.items()}}
+    run: Run[Any, Any, Any] = Run(
+        learner=learner,
+        problem=given,
+        experience=experience,
+        digest=digest(experience) if checksum is None else checksum,
+        recorder=recorder,
+        saved=saved,
+        hyperparameters=hyperparameters(shown, n_experience=n_experience),
+        configuration=yaml.safe_dump(described, sort_keys=False),
+        every=settings.every,
+        talks=talks,
+        safe_point=lambda: None,
+        began=began,
+    )
+    return run.perform(notes)[0]
 
 
-def _of_log(learner: Any, problem: Given, experience: Any) -> tuple[Log | None, Any]:
-    """The log, if ``problem`` is one, and the experience: its own, if no other is given."""
+def _of_log(learner: Any, problem: Given, experience: Any) -> tuple[Log | None, Known, Any]:
+    """The log, if ``problem`` is one; what there is to learn; what from: its own experience, if no other is given."""
     if not isinstance(problem, Log):
-        return None, experience
+        return None, problem, experience
     own = problem.experience if isinstance(learner, Replicas) else problem.recording
-    return problem, own if experience is None else experience
-
-
-def _read(saved: Checkpoints, many: bool) -> Solution | ReplicaSolution:
-    """The solution of a run that is complete."""
-    saved.clear()
-    kind, name = (ReplicaSolution, "replicas.npz") if many else (Solution, "solution.npz")
-    return kind.load(saved.directory / name)
-
-
-def _warn(notes: list[str]) -> None:
-    for text in notes:
-        warnings.warn(text, Note, stacklevel=3)
+    return problem, problem.problem, own if experience is None else experience
 
 
 def _checked(
     learner: Any, experience: object, settings: EvaluationSettings, checkpoint_every: float | None
-) -> StreamLearner[Any, Any] | Exact:
+) -> TabularLearner[Any]:
     """The learner, or the first of replicas. Raises InputError for arguments of ``train`` that cannot be used."""
     if checkpoint_every is not None and not (checks.is_number(checkpoint_every) and checkpoint_every >= 0):
         raise InputError("checkpoint_every", checkpoint_every, "seconds >= 0, or None")
     checks.instance("evaluation", settings, EvaluationSettings, "EvaluationSettings, or None")
     many = isinstance(learner, Replicas)
     one = learner.learners[0] if many else learner
-    if not isinstance(one, (StreamLearner, Exact)) or not is_dataclass(one):
+    if not is_dataclass(one) or isinstance(one, type):
         raise InputError("learner", learner, "a learner, as AlgorithmS1(): a dataclass derived from StreamLearner")
-    for name in ("beta", "prior_policy"):
-        if not hasattr(one, name):
-            raise InputError("learner", type(one).__name__, f"one that has the field {name}")
+    absent = [name for name in CONTRACT if not hasattr(one, name)]
+    if absent:
+        raise InputError("learner", type(one).__name__, f"a learner: it has no {', '.join(absent)}")
     if learner.needs_model != (experience is None):
         allowed = "None: the learner solves the model" if learner.needs_model else "given: tuples, or a source of them"
         raise InputError("experience", type(experience).__name__, allowed)
@@ -227,26 +243,41 @@ def _checked(
         streams_given = () if isinstance(experience, Simulation) else experience
         for data in streams_given:
             checks.instance("experience", data, Transitions, "Transitions, one per replica")
+    elif many and isinstance(experience, Experience):
+        checks.instance("experience", experience, Transitions, "Transitions: replicas hold their tuples in memory")
     elif experience is not None:
         checks.instance("experience", experience, Experience, EXPERIENCE)
     return one
 
 
-def _problem(given: Given, prior_policy: Table, horizon: int) -> Problem:
+def _problem(given: Known, prior_policy: Table, horizon: int) -> Problem:
     """As a ``Problem``, with the prior of the learner. Raises InputError."""
-    if isinstance(given, Log):
-        given = given.problem
     if isinstance(given, Problem):
-        prior = check_policy("learner.prior_policy", prior_policy, given.n_states, given.n_actions, given.allowed)
-        return replace(given, prior=prior, masks=ActionMasks(given.n_states, given.n_actions))
+        shape = given.n_states, given.n_actions
+        prior = check_policy("learner.prior_policy", prior_policy, *shape, given.allowed)
+        if given.env is None:
+            return replace(given, prior=prior)
+        env, source = encoded(given.env), encoded(given.source)
+        states, actions = (known or own for known, own in zip(given.names, labels_of(env), strict=True))
+        return replace(
+            given,
+            env=env,
+            source=source,
+            prior=prior,
+            masks=ActionMasks(*shape),
+            state_labels=states,
+            action_labels=actions,
+        )
     if isinstance(given, TabularMDP):
         prior = check_policy("learner.prior_policy", prior_policy, given.n_states, given.n_actions, given.allowed)
         return Problem(TabularEnv(given), given, prior, given, horizon=horizon, name="mdp")
     checks.instance("problem", given, gym.Env, "an environment of Gymnasium's, a TabularMDP or a Problem")
+    given = encoded(given)
     mdp, shape = known_mdp(given), sizes(given)
     prior = check_policy("learner.prior_policy", prior_policy, *shape, None if mdp is None else mdp.allowed)
     name = given.spec.id if given.spec is not None else type(given.unwrapped).__name__
-    return Problem(given, given, prior, mdp, None, steps_of(given, horizon), name, ActionMasks(*shape))
+    horizon = steps_of(given, horizon)
+    return Problem(given, given, prior, mdp, None, horizon, name, ActionMasks(*shape), *labels_of(given))
 
 
 def _of_replicas(
@@ -260,6 +291,10 @@ def _of_replicas(
         return experience, seeds
     if (simulation := experience.simulation(problem, seeds, None)) is not None:
         return simulation, seeds
+    if experience.one_stream and len(replicas) > len(groups_among(replicas.learners)[0]):
+        raise InputError(
+            "experience", type(experience).__name__, "a source of many streams: equal replicas of one are equal"
+        )
     recorded = [accepted(experience(problem, one, lambda _: None))[0] for one in seeds]
     held = [data for data in recorded if isinstance(data, Transitions)]
     if len(held) < len(recorded):
@@ -278,65 +313,23 @@ def _described(
     settings: EvaluationSettings,
 ) -> dict[str, Any]:
     """Settings by name: a directory of other settings is refused."""
+    one = learner.learners[0] if isinstance(learner, Replicas) else learner
+    kind = type(one)
+    values = plain("learner", one)
     if isinstance(learner, Replicas):
-        name = type(learner.learners[0]).__name__
-        own = {str(r): _plain(one) for r, one in enumerate(learner.learners)}
-        values = own["0"] if all(one == own["0"] for one in own.values()) else own
-        values = {"n_replicas": len(learner), **values}
-    else:
-        name, values = type(learner).__name__, _plain(learner)
+        own = [plain("learner", other) for other in learner.learners]
+        values |= {"n_replicas": len(learner)}
+        if any(other != own[0] for other in own):
+            values |= {"replicas": own}
     source = {"name": type(experience).__name__, "module": type(experience).__module__}
     if isinstance(experience, (Source, Simulation)):
-        source |= _plain(experience)
-    one = learner.learners[0] if isinstance(learner, Replicas) else learner
-    models = {key: _plain(getattr(problem, key)) for key in ("mdp", "episode", "horizon", "prior")}
-    models["source"] = _plain(problem.source) if isinstance(problem.source, TabularMDP) else None
+        source |= plain("experience", experience)
+    models = {key: plain(f"problem.{key}", getattr(problem, key)) for key in ("mdp", "episode", "horizon", "prior")}
+    models["source"] = plain("problem.source", problem.source) if isinstance(problem.source, TabularMDP) else None
     return {
-        "env": {"name": problem.name, **models, **_environment(problem.env)},
-        "learner": {"name": name, "module": type(one).__module__, **values},
+        "env": {"name": problem.name, **models, **environment(problem.env)},
+        "learner": {"name": kind.__name__, "module": kind.__module__, **values},
         "experience": source,
         "evaluation": asdict(settings),
         "seed": seed,
     }
-
-
-def _environment(env: gym.Env[Any, Any] | None) -> dict[str, Any]:
-    """Class, id and arguments, as far as Gymnasium knows them."""
-    if env is None:
-        return {"environment": "none"}
-    kind = type(env.unwrapped)
-    spec = {} if env.spec is None else {"id": env.spec.id, "kwargs": _plain(env.spec.kwargs)}
-    return {"environment": f"{kind.__module__}.{kind.__qualname__}", **spec}
-
-
-def _plain(value: object) -> Any:  # what YAML and JSON hold
-    """Numbers, text and containers; of an array or a model its shape and the SHA-256 of its bytes."""
-    if isinstance(value, TabularMDP):
-        p = value.transition
-        parts: tuple[np.ndarray, ...] = (p.indptr, p.indices, p.data, value.reward, value.start)
-        if not value.allowed.all():
-            parts += (value.allowed,)
-        return f"{value.n_states} states, {value.n_actions} actions, {_sha256(parts)}"
-    if isinstance(value, torch.Tensor):
-        value = value.detach().cpu().numpy()
-    if isinstance(value, np.ndarray):
-        return f"array {list(value.shape)}, {_sha256((value,))}"
-    if isinstance(value, np.generic):
-        value = value.item()
-    if is_dataclass(value) and not isinstance(value, type):
-        return {f.name: _plain(getattr(value, f.name)) for f in fields(value)}
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple, range)):
-        return [_plain(item) for item in value]
-    if value is None or isinstance(value, (bool, int, float, str)):
-        return value
-    named: Any = value if callable(value) else type(value)
-    return f"{getattr(named, '__module__', '')}.{getattr(named, '__qualname__', type(value).__qualname__)}"
-
-
-def _sha256(arrays: Sequence[np.ndarray]) -> str:
-    whole = hashlib.sha256()
-    for array in arrays:
-        whole.update(np.ascontiguousarray(array).tobytes())
-    return whole.hexdigest()[:16]

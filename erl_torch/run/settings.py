@@ -13,6 +13,7 @@ from typing import Any
 from omegaconf import MISSING, DictConfig, OmegaConf
 
 from erl_torch.checks import InputError
+from erl_torch.guesses import did_you_mean
 
 
 @dataclass
@@ -121,10 +122,11 @@ def check_keys(cfg: DictConfig, schema: type = Train) -> None:
 def check_comparison_keys(cfg: DictConfig) -> None:
     """``check_keys`` for ``conf/compare.yaml``: ``learner`` holds the settings of several, by name."""
     _check_node(cfg, Compare, "")
-    names = [str(name) for name, settings in cfg.learner.items() if "class" in settings]
+    learners = cfg.learner.items()
+    names = [str(name) for name, settings in learners if isinstance(settings, DictConfig) and "class" in settings]
     for name in map(str, cfg.learner):
         if name not in names:
-            raise InputError(f"learner.{name}", "", f"left out: the learners are {', '.join(names)}")
+            raise InputError(f"learner.{name}", cfg.learner[name], f"left out: the learners are {', '.join(names)}")
 
 
 def check_reproduction_keys(cfg: DictConfig) -> None:
@@ -136,7 +138,8 @@ def _check_node(node: DictConfig, schema: Any, prefix: str) -> None:  # a datacl
     names = [field.name for field in fields(schema)] if is_dataclass(schema) else list(map(str, node))
     for name in map(str, node):
         if name not in names:
-            raise InputError(prefix + name, node[name], f"left out: no such key; there are {', '.join(names)}")
+            hint = did_you_mean(name, names, prefix + "{}")
+            raise InputError(prefix + name, node[name], f"left out: no such key; there are {', '.join(names)}{hint}")
         if OmegaConf.is_missing(node, name):
             raise InputError(prefix + name, "???", f"given, as in {prefix}{name}=VALUE")
         if not OmegaConf.is_interpolation(node, name) and OmegaConf.is_dict(node[name]):

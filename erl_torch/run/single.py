@@ -40,8 +40,10 @@ from erl_torch.run.report import (
     last_rows,
     mean_return,
     optimal_tags,
+    success_rate,
     versions,
 )
+from erl_torch.run.verdict import verdict
 from erl_torch.solution import Solution, proven
 from erl_torch.solvers import certify, solve_soft_bellman
 
@@ -109,7 +111,8 @@ class SingleRecorder:
         if self.experience is None:
             return None
         next_actions = self.learner.drawn_from_prior == "a_next"
-        return reservations.count(self.experience, self.problem.n_states, self.problem.n_actions, next_actions)
+        n_states, n_actions = self.problem.prior.shape
+        return reservations.count(self.experience, n_states, n_actions, next_actions, self.problem.names)
 
     @functools.cached_property
     def of_data(self) -> DataJudge | None:
@@ -131,13 +134,19 @@ class SingleRecorder:
         return noted
 
     def _measure(self, policy: Policy) -> Evaluation:
-        p, e, exact = self.problem, self.settings, None
+        p, e = self.problem, self.settings
+        exact = succeeds = None
         if p.env is None:
             known = np.nan if self.of_data is None else self.of_data.objective(policy.numpy(), self.learner.beta)
             return Evaluation(np.nan, np.nan, known)
         if p.episode is not None:
             exact = functools.partial(mean_return, p.episode, p.horizon)
-        return evaluate(p.env, policy, self.learner.beta, self.rng, e.n_episodes, p.horizon, p.prior, self.model, exact)
+            if p.success is not None:
+                succeeds = functools.partial(success_rate, p.episode, p.success, p.horizon)
+        steps = e.n_episodes, p.horizon
+        return evaluate(
+            p.env, policy, self.learner.beta, self.rng, *steps, p.prior, self.model, exact, succeeds, p.ends
+        )
 
     # -- records --------------------------------------------------------------------------------------
 
@@ -153,9 +162,12 @@ class SingleRecorder:
         return optimal_tags(solution, self.model, self.problem)
 
     @property
-    def boards(self) -> Boards:
+    def shape(self) -> tuple[int, ...]:
+        return ()
+
+    def boards(self, alone: bool) -> Boards:
         table = with_own(self.learner.quantities)
-        return layout([*self._names(self.start), *evaluation_tags(self.first)], self._constant, table)
+        return layout([*self._names(self.start), *evaluation_tags(self.first)], self._constant, table, alone)
 
     def open(self, board: Board, goes_on: bool) -> None:
         board.lines(self._constant)
@@ -164,8 +176,14 @@ class SingleRecorder:
             self._draw(self.start, 0, "prior policy", board)
 
     def record(self, state: TabularState, row: Row, milestone: str, board: Board) -> None:
-        self.last = self._measure(state.policy)
         position = self.learner.position(state)
+        policy = state.policy
+        if not isinstance(policy, torch.Tensor) or policy.shape != self.problem.prior.shape:
+            shape = list(self.problem.prior.shape)
+            raise InputError("policy of the learner", type(policy).__name__, f"a torch.Tensor {shape}, in every epoch")
+        if not torch.isfinite(policy).all():
+            raise NonFiniteError(position, "the policy has probabilities that are no numbers")
+        self.last = self._measure(policy)
         board.record(self._tags(state, position, row), position)
         if milestone:
             self._draw(state, position, milestone, board)
@@ -183,11 +201,14 @@ class SingleRecorder:
         if not self.settings.pictures:
             return
         grid = None if self.problem.env is None else grid_pictures.grid_of(self.problem.env)
+        names = self.problem.names
         heading = f"policy, {title}" if position else title
-        board.picture("policy", grid_pictures.policy_picture(state.policy.cpu().numpy(), grid, heading), position)
+        policy = state.policy.cpu().numpy()
+        board.picture("policy", grid_pictures.policy_picture(policy, grid, heading, names=names), position)
         if position and state.reward_bias is not None:
             bias = state.reward_bias.cpu().numpy()
-            board.picture("reward_bias", grid_pictures.bias_picture(bias, grid, f"reward bias, {title}"), position)
+            heading = f"reward bias, {title}"
+            board.picture("reward_bias", grid_pictures.bias_picture(bias, grid, heading, names=names), position)
 
     def _figures(self, row: Row) -> str:
         if "theta_lower" in row:
@@ -241,9 +262,12 @@ class SingleRecorder:
         rate = position / max(outcome.seconds, 1e-9)
         board.scalars({f"time/{self.learner.unit}_per_second": rate}, position)
         final = {"theta": solution.theta, "gap": solution.gap}
+        said = verdict([row.get("theta", np.nan) for row in outcome.history], solution, self.estimate)
+        board.texts({"answer": said})
         ends = {name: value for name, value in final.items() if value is not None}
         board.scalars(tagged("Final", figures(self.last) | ends), position)
-        return solution
+        names = self.problem.names
+        return replace(solution, state_labels=names.states, action_labels=names.actions)
 
     def save(self, solution: Solution, directory: Path) -> None:
         solution.save(directory / "solution.npz")
@@ -300,8 +324,8 @@ class SingleRecorder:
         rows = [
             (
                 q.row,
-                f"{before[q.name]:12{q.digits}}" if q.name in before else f"{'-':>12}",
-                f"{result[q.result]:12{q.digits}}" + of_play * (q.name == "theta"),
+                f"{before[q.name]:z12{q.digits}}" if q.name in before else f"{'-':>12}",
+                f"{result[q.result]:z12{q.digits}}" + of_play * (q.name == "theta"),
             )
             for q in QUANTITIES
             if q.digits and q.name in logged and result[q.result] is not None

@@ -21,6 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from erl_torch import checks
 from erl_torch.checks import InputError
+from erl_torch.compiled import announcement
 from erl_torch.experience.experience import Experience, permitted
 from erl_torch.experience.log import Log
 from erl_torch.experience.simulation import digest, longest
@@ -30,6 +31,7 @@ from erl_torch.learners.replicas import Replicas
 from erl_torch.learners.s1 import kernels
 from erl_torch.log.tensorboard import hyperparameters
 from erl_torch.mdp.from_gymnasium import sizes
+from erl_torch.mdp.tabular import check_policy
 from erl_torch.notes import collected, note
 from erl_torch.problem import Problem
 from erl_torch.rng import streams
@@ -47,10 +49,11 @@ from erl_torch.run.build import (
     make_source,
     make_world,
 )
-from erl_torch.run.checkpoint import Checkpoints
+from erl_torch.run.checkpoint import Checkpoints, failure_of
 from erl_torch.run.groups import Group, groups_of
 from erl_torch.run.judge import EvaluationSettings
 from erl_torch.run.loop import Run, SafePoint
+from erl_torch.run.origin import shown
 from erl_torch.run.replicas import ReplicaRecorder
 from erl_torch.run.report import Title
 from erl_torch.run.settings import check_keys
@@ -83,13 +86,15 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
     many = cfg.n_replicas > 1 or bool(cfg.vary)
     torch.set_num_threads(1 if many else cfg.threads or 1)
     if not kernels.compiled_before():
-        print("compiling the loops, about ten seconds: on the first run only", file=sys.stderr)
+        print(announcement(), file=sys.stderr)
     settings = evaluation_settings(cfg.evaluation)
     device = "cpu" if many else cfg.learner.get("device", "cpu")
     saved = Checkpoints(directory, plain(cfg), cfg.checkpoint_every, device)
     if (result := saved.result()) is not None:
         print(f"note: the run in {directory} is complete", file=sys.stderr)
         saved.clear()
+        if (failure := failure_of(result)) is not None:
+            raise failure
         return result
     for key in ("shared_stream", "keep_tuples"):
         if cfg[key] and not many:
@@ -102,8 +107,11 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
             print(f"{log.report}\n")
         else:
             env = stack.enter_context(contextlib.closing(make_env(cfg.env)))
-            world = make_world(cfg.env, env, safe_point)
             learner = make_learner(cfg.learner, *sizes(env))
+            prior = learner.prior_policy
+            if prior is not None:
+                prior = check_policy("learner.prior_policy", prior, *sizes(env))
+            world = make_world(cfg.env, env, safe_point, None if "beta" in cfg.vary else learner.beta, prior)
             if world.allowed is not None:
                 learner = with_prior(learner, world.allowed)
             problem = make_problem(cfg, env, world, learner)
@@ -117,7 +125,7 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
             digest=digest(experience),
             recorder=recorder,
             saved=saved,
-            hyperparameters=hyperparameters(plain(cfg), **more),
+            hyperparameters=hyperparameters(plain(cfg), shown(directory), **more),
             configuration=OmegaConf.to_yaml(cfg, resolve=True),
             every=settings.every,
             talks=True,
@@ -185,7 +193,7 @@ def _replicas(
         raise InputError("learner", cfg.learner.name, allowed)
     check_sizes(problem.n_states, problem.n_actions, cfg.n_replicas)
     vary = plain(cfg.vary)
-    groups = groups_of(vary, cfg.n_replicas, plain(cfg.learner))
+    groups = groups_of(vary, cfg.n_replicas, plain(cfg.learner), float(learner.beta))
     check_sizes(problem.n_states, problem.n_actions, cfg.n_replicas * len(groups))
     learners = [_with(learner, one) for one in groups for _ in range(cfg.n_replicas)]
     for one in learners[:: cfg.n_replicas]:

@@ -208,7 +208,7 @@ def numbers(cells: Cells, decimal_comma: bool) -> np.ndarray:
     # All at once, if all are numbers.
     if not decimal_comma and not any("_" in value for value in cells.values if isinstance(value, str)):
         with contextlib.suppress(TypeError, ValueError, OverflowError):
-            return np.append(np.array(cells.values, np.float64), np.nan)[cells.codes]
+            return np.asarray(np.append(np.array(cells.values, np.float64), np.nan)[cells.codes])
 
     def number(value: Any) -> float:
         if isinstance(value, str):

@@ -19,6 +19,7 @@ from erl_torch.envs.discretise import Discretise
 from erl_torch.experience.formats.format import Batch, Options, plugin, readable
 from erl_torch.experience.formats.table import Cells, InOrder
 from erl_torch.experience.transitions import COLUMNS
+from erl_torch.labels import Labels, SpaceLabels
 from erl_torch.mdp.tabular import check_policy
 from erl_torch.rng import streams
 
@@ -108,14 +109,18 @@ class Minari:
 
     def _tuples(self, episode: Episode, number: int, data: Spaces) -> tuple[Batch, bool]:
         r = np.asarray(episode.rewards)
-        s, a = self._states(episode.observations, data.observation_space), self._actions(episode.actions, data)
+        n = len(r)
+        s = self._states(episode.observations, data.observation_space, n + 1)
+        a = self._actions(episode.actions, data, n)
         if not (len(s) == len(a) + 1 == len(r) + 1 == len(episode.terminations) + 1):
             raise ValueError(f"episode {number} has {len(s)} observations, {len(a)} actions and {len(r)} rewards")
         if np.any(episode.terminations[:-1]):
             raise ValueError(f"episode {number} terminates before its last step")
         return {"s": s[:-1], "a": a, "r": r, "s_next": s[1:]}, bool(len(r) and episode.terminations[-1])
 
-    def _states(self, observations: object, space: Space) -> np.ndarray:
+    def _states(self, observations: object, space: Space, n: int) -> np.ndarray:
+        if (labels := _composed(space)) is not None:
+            return labels.encode_batch(observations, n, f"{self.path}: observations")
         x = np.asarray(observations)
         if x.ndim == 1 and x.dtype.kind in "iu":
             return np.asarray(x.astype(np.int64) - _start(space))
@@ -125,7 +130,9 @@ class Minari:
         x = x.astype(np.float64) if features is None else np.stack([features(row) for row in x])
         return np.asarray(self._bins.bins.cells(x))
 
-    def _actions(self, actions: object, data: Spaces) -> np.ndarray:
+    def _actions(self, actions: object, data: Spaces, n: int) -> np.ndarray:
+        if (labels := _composed(data.action_space)) is not None:
+            return labels.encode_batch(actions, n, f"{self.path}: actions")
         x = np.asarray(actions)
         if x.ndim == 1 and x.dtype.kind in "iu":
             return np.asarray(x.astype(np.int64) - _start(data.action_space))
@@ -178,6 +185,12 @@ def _as_cells(held: list[Batch], names: Sequence[str], rows: int) -> Iterator[di
 
 def _joined(batches: list[Batch]) -> Batch:
     return {name: np.concatenate([batch[name] for batch in batches]) for name in COLUMNS}
+
+
+def _composed(space: Space) -> SpaceLabels | None:
+    """The labels of a finite space that is not Discrete; None of any other."""
+    kinds = (gym.spaces.MultiDiscrete, gym.spaces.MultiBinary, gym.spaces.Tuple, gym.spaces.Dict)
+    return Labels.of_space(space) if isinstance(space, kinds) else None
 
 
 def _start(space: Space) -> int:

@@ -577,12 +577,13 @@ def gains(
 def line_12(u: np.ndarray, prior: np.ndarray, visited: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
     """(u of mean 1 [..., S, A], psi [..., S]).
 
-    ``visited`` [..., S, A]: pairs outside get the mean of u over their state's visited actions, or 1 if it has none.
+    ``visited`` [..., S, A]: pairs outside get the mean of u over their state's visited actions; where there are
+    none, they keep their u.
     """
     if visited is not None:
         weight = prior * visited
         mass = weight.sum(-1, keepdims=True)
-        mean = np.where(mass > 0, (weight * u).sum(-1, keepdims=True) / mass, 1.0)
+        mean = np.where(mass > 0, (weight * u).sum(-1, keepdims=True) / mass, u)
         u = np.where(visited | (prior == 0), u, mean)
     u = u / u.reshape(*u.shape[:-2], -1).mean(-1)[..., None, None]
     return u, 1 / (prior * u).sum(-1)

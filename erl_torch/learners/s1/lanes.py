@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from types import FunctionType
 from typing import Any
 
 import numpy as np
@@ -43,6 +44,12 @@ COMMON = (
 )  # arguments that interleaved learners share
 Array = np.ndarray
 Rates = tuple[Array, Array, Array]  # lr_u, lr_rho, smallest 1/rho, [lanes] each
+METHODS = [
+    name
+    for kind in (AlgorithmS1, StreamLearner)
+    for name, value in vars(kind).items()
+    if isinstance(value, (FunctionType, property)) and not name.startswith("__")
+]
 LANES = 32  # a block, while its tables fit the cache beside the core
 SMALL_TABLES = 1 << 17  # entries of z of a block that do
 ROWS = 256  # sampled at a time
@@ -54,6 +61,8 @@ def can_interleave(replicas: Together, experience: ReplicaExperience) -> bool:
     learners = replicas.learners
     if not isinstance(learners[0], AlgorithmS1) or learners[0].implementation != "fast":
         return False
+    if any(getattr(type(learners[0]), name) is not getattr(AlgorithmS1, name) for name in METHODS):
+        return False  # a class derived from it that does something another way
     if any(getattr(learner, name) != getattr(learners[0], name) for learner in learners for name in COMMON):
         return False
     return isinstance(experience, (Transitions, Simulation)) or len({len(data) for data in experience}) == 1
@@ -88,6 +97,9 @@ class LanesState:
     def milestone(self, learners: Sequence[StreamLearner[Any, Any]]) -> str:
         alive = next((r for r in range(len(self.beta)) if r not in self.ended), None)
         return "" if alive is None else learners[alive].milestone(self.replica(alive))
+
+    def epochs(self, r: int, n: int) -> int:
+        return round(n * self.ended[r][0].n_tuples / max(self.n_tuples, 1)) if r in self.ended else n  # all of a length
 
     @property
     def failures(self) -> Mapping[int, NonFiniteError]:
