@@ -22,6 +22,7 @@ _PUBLIC = {
     "evaluation": "Evaluation evaluate",
     "experience.collect": "collect",
     "experience.experience": "Experience",
+    "experience.log": "Log LogReport read_log",
     "experience.recording": "read_experience write_experience",
     "experience.rollouts": "collect_rollouts rollout",
     "experience.simulation": "Simulation",

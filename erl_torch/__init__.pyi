@@ -13,6 +13,9 @@ from erl_torch.evaluation import Evaluation as Evaluation
 from erl_torch.evaluation import evaluate as evaluate
 from erl_torch.experience.collect import collect as collect
 from erl_torch.experience.experience import Experience as Experience
+from erl_torch.experience.log import Log as Log
+from erl_torch.experience.log import LogReport as LogReport
+from erl_torch.experience.log import read_log as read_log
 from erl_torch.experience.recording import read_experience as read_experience
 from erl_torch.experience.recording import write_experience as write_experience
 from erl_torch.experience.rollouts import collect_rollouts as collect_rollouts

@@ -20,11 +20,11 @@ Policy: TypeAlias = torch.Tensor
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """An environment with finite spaces, and what is known of it.
+    """An environment with finite spaces, and what is known of it; or what a log alone tells (``erl_torch.read_log``).
 
     Args:
-        env: where policies are played.
-        source: where experience is collected: ``env``, or a model in its place.
+        env: where policies are played; None: a log is all that there is.
+        source: where experience is collected: ``env``, or a model in its place; None with ``env``.
         prior: the prior policy, [S, A], rows sum to 1; 0 where a state does not have the action.
         mdp: the model that policies are evaluated on, and that is solved to compare with; None where it is not known.
         episode: the model of one episode: its end is absorbed, without reward; None where there is none.
@@ -37,8 +37,8 @@ class Problem:
             episodes do not end, or that is not known.
     """
 
-    env: gym.Env[Any, Any]
-    source: TabularMDP | gym.Env[Any, Any]
+    env: gym.Env[Any, Any] | None
+    source: TabularMDP | gym.Env[Any, Any] | None
     prior: np.ndarray
     mdp: TabularMDP | None = None
     episode: TabularMDP | None = None

@@ -16,7 +16,7 @@ from gymnasium.envs.registration import load_env_creator
 from helpers import CONF, composed
 from omegaconf import OmegaConf
 
-from erl_torch import InputError, checks
+from erl_torch import InputError, checks, read_log
 from erl_torch.checks import InputError as ChecksInputError
 from erl_torch.cli import config
 from erl_torch.cli import main as cli
@@ -76,6 +76,9 @@ def test_keys_are_the_arguments_of_the_class(path):
         kind = classes.resolve(text["class"], "class")
         if path.parent.name == "learner":
             assert kind is LEARNERS[path.stem]
+    elif path.stem == "log":  # no environment: what read_log is told of it
+        assert keys < set(inspect.signature(read_log).parameters)
+        return
     elif not OmegaConf.is_missing(text, "id") and text.id in ENTRY_POINTS:
         kind = load_env_creator(gym.spec(text.id).entry_point)
     else:  # any environment of Gymnasium's: its arguments are in kwargs

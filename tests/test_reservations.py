@@ -100,7 +100,7 @@ def notes(tmp_path, *overrides, learner=SHORT, capsys=None):
 
 
 def of_stream(path):
-    return ("experience=recorded", f"experience.path={path}")
+    return ("env=windy_cliff", "experience=recorded", f"experience.path={path}")
 
 
 def having(lines, *texts):

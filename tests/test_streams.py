@@ -209,7 +209,7 @@ def test_missing_values_of_parquet_are_bad_tuples(tmp_path):
     columns = {name: getattr(SHORT, name).tolist() for name in COLUMNS}
     columns["s"][5] = columns["r"][7] = None
     pq.write_table(pa.table(columns), tmp_path / "t.parquet")
-    with pytest.raises(InputError, match=r"s\[5\]=-1"):
+    with pytest.raises(InputError, match=r"s\[5\]=missing: must be a whole number in \[0, 5\)"):
         FileRecording(tmp_path / "t.parquet", 5, 3)
     assert FileRecording(tmp_path / "t.parquet", 5, 3, on_bad="skip").n_skipped == 2
 
@@ -238,13 +238,18 @@ def test_short_and_damaged_columns(tmp_path):
     with pytest.raises(InputError, match=r"lacks r\.npy"):
         FileRecording(path, 5, 3)
     path = write_experience(PLAIN, tmp_path / "floats")
-    np.save(path / "s.npy", PLAIN.s.astype(float))
-    with pytest.raises(InputError, match="s=dtype float64: must be a column of whole numbers"):
-        FileRecording(path, 5, 3, on_bad="skip")
+    s = PLAIN.s.astype(float)
+    np.save(path / "s.npy", s)  # numbers that are whole
+    assert read_experience(path, 5, 3).checksum() == PLAIN.checksum()
+    s[[7, 9]] = 0.5, np.nan
+    np.save(path / "s.npy", s)
+    with pytest.raises(InputError, match=r"s\[7\]=0.5: must be a whole number in \[0, 5\)"):
+        FileRecording(path, 5, 3)
+    assert FileRecording(path, 5, 3, on_bad="skip").n_skipped == 2
 
 
 def test_refusals(tmp_path):
-    with pytest.raises(InputError, match=r"none\.npz: must be there: an npz or Parquet file"):
+    with pytest.raises(InputError, match=r"none\.npz: must be there: a CSV, Parquet, JSON-lines or npz file"):
         read_experience(tmp_path / "none.npz", 5, 3)
     path = written(tmp_path, PLAIN, "npz")
     with pytest.raises(InputError, match="on_bad=ignore"):
@@ -267,7 +272,7 @@ def test_refusals(tmp_path):
 
 @pytest.mark.parametrize(
     ("path", "module_name"),
-    [("minari:t.parquet", "minari"), ("t.parquet", "parquet"), ("t.npz", "npy"), ("t", "npy"), ("d.parquet", "npy")],
+    [("minari:t.parquet", "minari"), ("t.parquet", "rows"), ("t.npz", "npy"), ("t", "npy"), ("d.parquet", "npy")],
 )
 def test_the_first_format_that_claims_a_path_reads_it(tmp_path, monkeypatch, path, module_name):
     monkeypatch.chdir(tmp_path)
@@ -446,7 +451,7 @@ def test_command_line(tmp_path, typed_here):
     simulated = [*options, "experience.n_episodes=20", "experience.episode_length=100"]
     code, _, error = typed_here("train.py", *simulated, "experience.save_to=t/", "hydra.run.dir=a")
     assert code == 0, error
-    recorded = [*options, "experience=recorded", "experience.path=t"]
+    recorded = [*options, "env=windy_cliff", "experience=recorded", "experience.path=t"]
     code, _, error = typed_here("train.py", *recorded, "experience.chunk=100", "hydra.run.dir=b")
     assert code == 0, error
     results = [json.loads((tmp_path / name / "result.json").read_text()) for name in "ab"]

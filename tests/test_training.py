@@ -136,7 +136,7 @@ def test_same_seed_same_bits(tmp_path):
 def test_recorded_experience_is_the_simulated_one(tmp_path):
     first = bits(tmp_path, "a", f"experience.save_to={tmp_path}/tuples.npz")
     assert len(Transitions.load(tmp_path / "tuples.npz")) == 20_000
-    overrides = (*SMALL[1:], "evaluation.pictures=false", "experience=recorded")
+    overrides = (*SMALL[1:], "evaluation.pictures=false", "env=windy_cliff", "experience=recorded")
     train(composed(*overrides, f"experience.path={tmp_path}/tuples.npz"), tmp_path / "b")
     assert (tmp_path / "b" / "solution.npz").read_bytes() == first
 

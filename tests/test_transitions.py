@@ -45,7 +45,9 @@ def test_loads_any_npz_with_the_columns(authors, authors_tuples):
     [
         ({"s": [0, -1, 2]}, r"s\[1\]=-1: must be a whole number"),
         ({"s": [0, 2**31, 2]}, r"s\[1\]=2147483648"),
-        ({"a": [0.5, 1.0, 0.0]}, r"a=dtype float64: must be an array of whole numbers"),
+        ({"a": [1.0, 0.5, 0.0]}, r"a\[1\]=0.5: must be a whole number in \[0, 2\*\*31\)"),
+        ({"a": [1.0, 0.0, np.nan]}, r"a\[2\]=nan: must be a whole number"),
+        ({"a": [1.0, np.inf, 0.0]}, r"a\[1\]=inf: must be a whole number"),
         ({"r": [0.0, np.nan, 0.0]}, r"r\[1\]=nan: must be finite"),
         ({"r": ["a", "b", "c"]}, r"r=list of dtype <U1: must be an array of real numbers"),
         ({"s_next": [0, 1]}, r"columns=lengths .*'s_next': 2.*: must be of one length"),

@@ -17,12 +17,18 @@ from erl_torch.cli.paths import quoted
 from erl_torch.run.settings import Compare, Play, Reproduce, Standard, Suggest, Train
 
 NOT_COMPARED = ("exact",)  # it solves the model, and learns from no stream
+RECORDED = ("recorded", "erl_torch.experience.sources.Recorded")  # experience that needs no environment
 COMMANDS = {"train": Train, "compare": Compare, "reproduce": Reproduce, "play": Play}
 
 
 def slug(text: object) -> str:
     """``text`` as part of a file name: no separators, nothing a shell would touch."""
     return re.sub(r"[^A-Za-z0-9_.=+]+", "-", str(text)).strip("-.") or "run"
+
+
+def default_env(experience: str) -> str:
+    """The environment where none is given: recorded experience tells all that there is."""
+    return "log" if experience in RECORDED else "windy_cliff"
 
 
 def run_name(number: int, overrides: str) -> str:
@@ -43,6 +49,7 @@ def register() -> None:
     compared = [name for name in configurations.names("learner") if name not in NOT_COMPARED]
     store.store(name="every_learner", node={"defaults": [{f"learner@learner.{name}": name} for name in compared]})
     OmegaConf.register_new_resolver("slug", slug, replace=True)
+    OmegaConf.register_new_resolver("default_env", default_env, replace=True)
     OmegaConf.register_new_resolver("run_name", run_name, replace=True)
 
 

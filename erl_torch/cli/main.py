@@ -51,6 +51,8 @@ OPEN_NODES = (
     "env.kwargs=",
     "env.tile_rewards.",
     "env.tile_rewards=",
+    "experience.columns.",
+    "experience.columns=",
     "vary.",
     "vary=",
 )  # keys of the user's own: no schema lists them

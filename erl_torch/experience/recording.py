@@ -4,7 +4,8 @@
 
     FILE.npz          columns s, a, r, s_next, a_next, as ``Transitions.save`` writes them
     DIRECTORY         s.npy, a.npy, r.npy, s_next.npy, a_next.npy, as ``ColumnWriter`` writes them: the fastest
-    FILE.parquet      the same five columns (needs pyarrow)
+    FILE.csv, .tsv, .jsonl, .parquet, .pq, or a directory of such parts: see erl_torch.experience.formats.rows
+                      (CSV and Parquet need pyarrow)
     minari:DATASET    episodes of a local Minari data set (needs minari and h5py)
 
 (``erl_torch.experience.formats`` has one module per format) and reads everything once: each tuple is checked against
@@ -19,7 +20,7 @@ be trusted. (Damage shows by the file's own checksums, which Parquet has only wh
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -31,19 +32,25 @@ from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.experience.experience import EXPERIENCE, Experience
 from erl_torch.experience.formats import ALLOWED, FORMATS
-from erl_torch.experience.formats.format import Batch, Format, Options
+from erl_torch.experience.formats.format import Batch, Format, Options, Reader
 from erl_torch.experience.formats.npy import ColumnWriter
+from erl_torch.experience.formats.rows import reader_of
+from erl_torch.experience.formats.table import is_frame, of_frame
 from erl_torch.experience.transitions import COLUMNS, TYPES, Checksum, Transitions, join, regroup
+from erl_torch.labels import Labels
 
 CHUNK = 1 << 22  # tuples held in memory: 100 MB of columns
 READ = 1 << 16  # tuples at a time, of longer ones: they stay in the processor's cache
+
+Recordable = Any
+"""A path (``str`` or ``os.PathLike``), a frame or table that Arrow can take, or arrays by name: what can be read."""
 
 
 class FileRecording:
     """An ``Experience`` in files, read anew in every pass.
 
     Args:
-        path: see the module's docstring.
+        path: see the module's docstring; or a frame (of pandas, polars, pyarrow), or arrays by name.
         n_states, n_actions: sizes of the problem.
         on_bad: "stop" or "skip", for bad tuples.
         chunk: tuples in memory at most, >= 1 (some thousands, if a learner has to have so many at once).
@@ -51,6 +58,8 @@ class FileRecording:
             where a' comes from.
         report: called with the number of tuples read so far.
         format: reads the path; None: the first of ``erl_torch.experience.formats`` that claims it.
+        columns: of a table, which are which, as {"s": "segment", "r": "profit"}; the others are found by their names.
+        state_labels, action_labels: of the recorded states and actions; None: they are whole numbers from 0.
 
     Raises:
         InputError: what is wrong, with file and row.
@@ -60,7 +69,7 @@ class FileRecording:
 
     def __init__(
         self,
-        path: str | os.PathLike[str],
+        path: Recordable,
         n_states: int,
         n_actions: int,
         *,
@@ -72,17 +81,17 @@ class FileRecording:
         seed: int = 0,
         report: Callable[[int], object] | None = None,
         format: Format | None = None,
+        columns: Mapping[str, Any] | None = None,
+        state_labels: Labels | None = None,
+        action_labels: Labels | None = None,
     ) -> None:
         checks.one_of("on_bad", on_bad, ("stop", "skip"))
         chunk = checks.at_least("chunk", chunk, 1)
         n_states, n_actions = checks.at_least("n_states", n_states, 1), checks.at_least("n_actions", n_actions, 1)
-        checks.instance("path", path, (str, os.PathLike), "a path")
         if n_states * n_actions > np.iinfo(np.int32).max:
             raise InputError("n_states * n_actions", n_states * n_actions, "below 2**31")
-        claimant = next((one for one in (FORMATS if format is None else (format,)) if one.claims(str(path))), None)
-        if claimant is None:
-            raise InputError("path", path, ALLOWED if format is None else "claimed by the given format")
-        self._reader = claimant.reader(str(path), Options(n_states, n_actions, env, prior_policy, on_prior, seed))
+        options = Options(n_states, n_actions, env, prior_policy, on_prior, seed, columns, state_labels, action_labels)
+        self._reader = _reader(path, options, format)
         self._chunk, self._strict = chunk, on_bad == "stop"
         self._sizes = n_states, n_actions
         self._limits = {"s": n_states, "a": n_actions, "s_next": n_states, "a_next": n_actions}
@@ -97,6 +106,7 @@ class FileRecording:
             if report is not None:
                 report(self._n)
         self.n_skipped += self._reader.short
+        self.first_skipped = self.first_skipped or getattr(self._reader, "first_bad", "")
         self._counted = True
         if not self._n:
             raise InputError(f"path={self.path}", "0 good tuples", "at least one tuple")
@@ -161,8 +171,8 @@ class FileRecording:
                 )
 
     def _typed(self, name: str, column: np.ndarray) -> np.ndarray:
-        kinds, allowed = ("iuf", "numbers") if name == "r" else ("iu", "whole numbers")
-        if column.dtype.kind not in kinds:
+        if column.dtype.kind not in "iuf":  # numbers that are not whole are bad tuples
+            allowed = "numbers" if name == "r" else "whole numbers"
             raise InputError(f"path={self.path}: {name}", f"dtype {column.dtype}", f"a column of {allowed}")
         with np.errstate(over="ignore"):  # of wider numbers: they are no longer finite
             return np.asarray(column, np.float64) if name == "r" else column
@@ -175,6 +185,10 @@ class FileRecording:
                 return None
             if name == "r":
                 mask = ~np.isfinite(column)
+                if mask.any():
+                    wrong[name] = mask
+            elif column.dtype.kind == "f":
+                mask = ~((column >= 0) & (column < self._limits[name]) & (column == np.floor(column)))
                 if mask.any():
                     wrong[name] = mask
             elif column.min() < 0 or column.max() >= self._limits[name]:
@@ -192,6 +206,18 @@ class FileRecording:
         return np.asarray(bad)
 
 
+def _reader(path: Recordable, options: Options, format: Format | None) -> Reader:
+    """What reads ``path``. Raises InputError where nothing does."""
+    if not isinstance(path, (str, os.PathLike)):
+        if format is not None or not is_frame(path):
+            raise InputError("path", type(path).__name__, "a path, a frame, or arrays by name")
+        return reader_of(of_frame(path), options)
+    claimant = next((one for one in (FORMATS if format is None else (format,)) if one.claims(str(path))), None)
+    if claimant is None:
+        raise InputError("path", path, ALLOWED if format is None else "claimed by the given format")
+    return claimant.reader(str(path), options)
+
+
 def _stamp(path: str) -> list[tuple[str, int, int]]:
     """(name, size, time of change in ns) of the file, or of those in the directory; nothing of what is neither."""
     root = Path(path)
@@ -200,7 +226,7 @@ def _stamp(path: str) -> list[tuple[str, int, int]]:
 
 
 def read_experience(
-    path: str | os.PathLike[str],
+    path: Recordable,
     n_states: int,
     n_actions: int,
     *,
@@ -212,6 +238,9 @@ def read_experience(
     seed: int = 0,
     report: Callable[[int], object] | None = None,
     format: Format | None = None,
+    columns: Mapping[str, Any] | None = None,
+    state_labels: Labels | None = None,
+    action_labels: Labels | None = None,
 ) -> Transitions | FileRecording:
     """Read the experience at ``path``: into memory where it is no longer than ``chunk``, else in every pass anew.
 
@@ -229,6 +258,9 @@ def read_experience(
         seed=seed,
         report=report,
         format=format,
+        columns=columns,
+        state_labels=state_labels,
+        action_labels=action_labels,
     ).held()
 
 

@@ -8,16 +8,18 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.experience.collect import collect, record
 from erl_torch.experience.experience import Experience
 from erl_torch.experience.formats.npy import check_target
+from erl_torch.experience.log import Log, read_log
 from erl_torch.experience.recording import CHUNK, FileRecording, read_experience
 from erl_torch.experience.simulation import Simulation
 from erl_torch.files import read_npy
@@ -83,6 +85,8 @@ class Simulate(Source):
         return self.n_episodes * self.episode_length
 
     def __call__(self, problem: Problem, seed: int, report: Report) -> Experience:
+        if problem.source is None:
+            raise InputError("experience", type(self).__name__, "recorded: there is no environment to collect from")
         sizes = self.n_episodes, self.episode_length
         behaviour = self._behaviour()
         if self.save_to is None:
@@ -114,13 +118,14 @@ class Recorded(Source):
     """A stream recorded before.
 
     Args:
-        path, on_bad, chunk, on_prior: as of ``FileRecording``.
+        path, on_bad, chunk, on_prior, columns: as of ``FileRecording``.
     """
 
     path: str
     on_bad: str = "stop"
     chunk: int = CHUNK
     on_prior: bool = False
+    columns: dict[str, Any] = field(default_factory=dict)
 
     one_stream: ClassVar[bool] = True
     work: ClassVar[str] = "reading"
@@ -134,6 +139,23 @@ class Recorded(Source):
             chunk=self.chunk,
             env=problem.env,
             prior_policy=problem.prior,
+            on_prior=self.on_prior,
+            seed=seed,
+            report=report,
+            columns=self.columns,
+            state_labels=problem.state_labels,
+            action_labels=problem.action_labels,
+        )
+
+    def log(self, seed: int, unseen_actions: str, prior_policy: ArrayLike | None, report: Report) -> Log:
+        """All that there is, without an environment: as ``read_log``."""
+        return read_log(
+            self.path,
+            columns=self.columns,
+            unseen_actions=unseen_actions,
+            prior_policy=prior_policy,
+            on_bad=self.on_bad,
+            chunk=self.chunk,
             on_prior=self.on_prior,
             seed=seed,
             report=report,

@@ -204,9 +204,12 @@ def _column(name: str, value: object) -> np.ndarray:
             row = int(np.argmin(np.isfinite(column)))
             raise InputError(f"r[{row}]", column[row], "finite")
         return column
-    if column.dtype.kind not in "iu" and column.size:
+    if column.dtype.kind not in "iuf" and column.size:
         raise InputError(name, f"dtype {column.dtype}", "an array of whole numbers")
+    if column.dtype.kind == "f" and not (whole := column == np.floor(column)).all():  # false for NaN
+        row = int(np.argmin(whole))
+        raise InputError(f"{name}[{row}]", column[row].item(), "a whole number in [0, 2**31)")
     if column.size and (column.min() < 0 or column.max() > np.iinfo(np.int32).max):
         row = int(np.argmax((column < 0) | (column > np.iinfo(np.int32).max)))
-        raise InputError(f"{name}[{row}]", int(column[row]), "a whole number in [0, 2**31)")
+        raise InputError(f"{name}[{row}]", column[row].item(), "a whole number in [0, 2**31)")
     return np.ascontiguousarray(column, dtype=np.int32)

@@ -221,7 +221,8 @@ QUANTITIES = (
         RATE,
         "J: reward rate minus KL(policy \\|\\| prior)/beta a step. Stationary and exact where the model is known (only"
         " somewhere between its bounds where products of probabilities underflow); otherwise over the sampled "
-        "episodes. Its maximum is -theta, so compare it with minus `learner/theta`",
+        "episodes; of a log alone, in the model of its counts. Its maximum is -theta, so compare it with minus "
+        "`learner/theta`",
         _FIGURE,
         board=RETURNS,
         chart="objective; optimal, prior",

@@ -5,7 +5,8 @@ from __future__ import annotations
 import contextlib
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -22,12 +23,13 @@ from erl_torch.envs.ends import EndReward
 from erl_torch.envs.estimate import estimate_mdp
 from erl_torch.experience.collect import COLUMN_BYTES
 from erl_torch.experience.experience import EXPERIENCE, Experience
+from erl_torch.experience.log import UNSEEN, Log
 from erl_torch.experience.recording import FileRecording
 from erl_torch.experience.simulation import KEEP_BYTES, TUPLE_BYTES, ReplicaExperience
-from erl_torch.experience.sources import Source
+from erl_torch.experience.sources import Recorded, Source
 from erl_torch.experience.transitions import Transitions, join
 from erl_torch.files import read_npy
-from erl_torch.learners.learner import CONTRACT, TabularLearner
+from erl_torch.learners.learner import CONTRACT, TabularLearner, with_prior
 from erl_torch.mdp.ends import EndRule, Failures
 from erl_torch.mdp.from_gymnasium import (
     MeanRewardWarning,
@@ -52,6 +54,8 @@ TABLES = 8  # of a learner's size, about, while it learns and is evaluated
 REPLICA_BYTES = 10_000  # of a replica, besides: generators and settings
 LABELS = ("class", "name")  # keys of every group that are no arguments
 OF_THE_MODEL = ("stream", "n_samples", "model_seed")  # of a control task
+NO_ENV = "none"  # in the place of Gymnasium's id
+OF_A_LOG = (*LABELS, "id", "suggest", "unseen_actions")
 OF_NO_ENV = (*KEYS_OF_ENV, *OF_THE_MODEL, *OF_EVERY_ENV)
 
 
@@ -295,6 +299,54 @@ def _control_world(cfg: DictConfig, env: gym.Env[Any, Any], safe_point: SafePoin
         ).mdp
     # Episodes of the stream start in any cell, so that all are learnt about.
     return World(TabularMDP(mdp.transition, mdp.reward), mdp)
+
+
+# -- a log alone ----------------------------------------------------------------------------------------
+
+
+def is_log(cfg: DictConfig) -> bool:
+    """Whether ``cfg``, of the environment, says that there is none."""
+    return bool(cfg.get("id") == NO_ENV)
+
+
+def make_log(cfg: DictConfig, safe_point: SafePoint) -> tuple[Log, TabularLearner[Any]]:
+    """What the log of the run ``cfg`` says, and the learner, with the prior that it says. Raises InputError."""
+    learner: TabularLearner[Any] = _made(cfg.learner, learner_class(cfg.learner), "learner")
+    if learner.needs_model:
+        raise InputError("learner", cfg.learner.name, "one that learns from experience: a log has no model to solve")
+    source = make_source(cfg.experience)
+    if not isinstance(source, Recorded):
+        allowed = f"recorded: env={cfg.env.name} has no environment to collect from"
+        raise InputError("experience", cfg.experience.name, allowed)
+    for key in map(str, cfg.env):
+        if key not in OF_A_LOG:
+            raise InputError(f"env.{key}", cfg.env[key], "left out: no such key; there is unseen_actions")
+    checks.one_of("env.unseen_actions", cfg.env.unseen_actions, UNSEEN)
+    try:
+        with group("experience"), _collecting(source.work, None, safe_point) as report:
+            log = source.log(cfg.seed, cfg.env.unseen_actions, learner.prior_policy, report)
+    except InputError as error:
+        name = error.key.removeprefix("experience.")
+        if name.startswith("prior_policy"):
+            raise InputError(f"learner.{name}", error.value, error.allowed) from error
+        raise
+    check_sizes(log.n_states, log.n_actions)
+    learner = with_prior(learner, log.problem.allowed)
+    with group("learner"):
+        learner.init(log.n_states, log.n_actions)
+    return log, learner
+
+
+@dataclass(frozen=True, eq=False)
+class FromLog(Source):
+    """The tuples of a log that has been read."""
+
+    log: Log
+
+    one_stream: ClassVar[bool] = True
+
+    def __call__(self, problem: Problem, seed: int, report: Callable[[int], None]) -> FileRecording:
+        return self.log.recording
 
 
 def make_problem(cfg: DictConfig, env: gym.Env[Any, Any], world: World, learner: TabularLearner[Any]) -> Problem:

@@ -86,8 +86,10 @@ def _container(key: str, value: object, depth: int) -> Any:
     return None
 
 
-def environment(env: gym.Env[Any, Any]) -> dict[str, Any]:
+def environment(env: gym.Env[Any, Any] | None) -> dict[str, Any]:
     """Class, id and arguments, wrappers and time limit, as far as Gymnasium knows them."""
+    if env is None:
+        return {"environment": "none"}
     wrappers = []
     inside: Any = env
     while isinstance(inside, gym.Wrapper):

@@ -22,7 +22,7 @@ from erl_torch.learners.replicas import ReplicaSolution
 from erl_torch.mdp.from_gymnasium import sizes
 from erl_torch.mdp.tabular import check_policy
 from erl_torch.rng import streams
-from erl_torch.run.build import make_env, reads_table
+from erl_torch.run.build import is_log, make_env, reads_table
 from erl_torch.run.classes import is_own
 from erl_torch.run.settings import Play, check_keys
 from erl_torch.solution import Solution
@@ -58,6 +58,9 @@ def play(cfg: DictConfig) -> Played:
     run = find_run(cfg.run)
     settings = run_settings(run)
     _check_named(cfg, settings, run)
+    if is_log(settings.env):
+        allowed = f"one with an environment: a log alone has none to play in; its policy is in {run / 'policy.csv'}"
+        raise InputError("run", run, allowed)
     table = run_policy(run, cfg.replica)
     mode = MODES.get(cfg.render)
     with contextlib.closing(make_env(settings.env)) as plain:

@@ -17,7 +17,8 @@ from erl_torch.empirical.reservations import Counted, Reservation
 from erl_torch.empirical.uncertainty import Estimate
 from erl_torch.evaluation import Judge, evaluate
 from erl_torch.experience.collect import COLUMN_BYTES
-from erl_torch.experience.simulation import KEEP_BYTES, ReplicaExperience, Simulation, longest
+from erl_torch.experience.log import Log
+from erl_torch.experience.simulation import KEEP_BYTES, ReplicaExperience, Simulation, longest, streams_of
 from erl_torch.experience.transitions import Transitions
 from erl_torch.files import write_png
 from erl_torch.labels import NUMBERS, Names
@@ -31,7 +32,15 @@ from erl_torch.problem import Problem
 from erl_torch.rng import streams
 from erl_torch.run.checkpoint import Content
 from erl_torch.run.groups import MOST_LOGGED, Group, Record, setting_text, statistics
-from erl_torch.run.judge import SMALL, EvaluationSettings, episode_model, judging_model, of_data
+from erl_torch.run.judge import (
+    SMALL,
+    DataJudge,
+    EvaluationSettings,
+    data_judge,
+    episode_model,
+    judging_model,
+    of_data,
+)
 from erl_torch.run.loop import Outcome, Row, SafePoint
 from erl_torch.run.report import Title, ended_as, last_rows, plural, versions
 from erl_torch.run.verdict import verdict_of_replicas
@@ -65,6 +74,7 @@ class ReplicaRecorder:
         settings: what is measured.
         title: names, for result, pictures and summary.
         safe_point: called between streams that are read; may raise.
+        log: where it is all that there is.
     """
 
     replicas: Replicas
@@ -76,11 +86,19 @@ class ReplicaRecorder:
     settings: EvaluationSettings
     title: Title
     safe_point: SafePoint
+    log: Log | None = None
 
     def __post_init__(self) -> None:
         learners = self.replicas.learners
         betas = [learner.beta for learner in learners]
-        self.judges = Judges(self.problem, self.settings, betas, self.seeds, self.replicas.workers)
+        self.judges = Judges(
+            self.problem,
+            self.settings,
+            betas,
+            self.seeds,
+            self.replicas.workers,
+            _judges_of(self.problem, self.experience),
+        )
         texts, self.data = reservations_of(
             self.experience,
             learners,
@@ -239,6 +257,7 @@ class ReplicaRecorder:
             "n_tuples": outcome.state.work,
             "seconds_learning": round(outcome.seconds, 3),
             "versions": versions(),
+            **({} if self.log is None else {"log": self.log.report.content()}),
         }
 
     def _seeds_text(self) -> str:
@@ -300,7 +319,9 @@ class Judges:
         betas: Sequence[float],
         seeds: Sequence[int],
         threads: int,
+        of_data: Sequence[DataJudge | None] = (),
     ) -> None:
+        self.of_data = list(of_data)
         self.problem, self.betas, self.n_episodes, self.threads = problem, betas, settings.n_episodes, threads
         self.rngs = [streams(seed).evaluation for seed in seeds]
         self.model = judging_model(problem, settings)
@@ -365,10 +386,18 @@ class Judges:
                 figures["return"] = self.problem.horizon * each(lambda r: self.of_episode.reward_per_step(policies[r]))
             if (succeeds := self.of_success) is not None:
                 figures["success_rate"] = self.problem.horizon * each(lambda r: succeeds.reward_per_step(policies[r]))
+        elif self.problem.env is None:
+            judges = self.of_data * len(policies) if len(self.of_data) == 1 else self.of_data
+            figures["objective"] = np.array(
+                [
+                    np.nan if judge is None else judge.objective(policy, beta)
+                    for judge, policy, beta in zip(judges, policies, self.betas, strict=True)
+                ]
+            )
         elif milestone:
-            p = self.problem
+            p, env = self.problem, self.problem.env
             played = [
-                evaluate(p.env, policy, beta, rng, self.n_episodes, p.horizon, p.prior, ends=p.ends)
+                evaluate(env, policy, beta, rng, self.n_episodes, p.horizon, p.prior, ends=p.ends)
                 for policy, beta, rng in zip(policies, self.betas, self.rngs, strict=True)
             ]
             figures["return"] = np.array([one.mean_return for one in played])
@@ -378,6 +407,13 @@ class Judges:
                 figures["reward_per_step"] = np.array([one.reward_per_step for one in played])
                 figures["objective"] = np.array([one.objective for one in played])
         return figures
+
+
+def _judges_of(problem: Problem, experience: ReplicaExperience) -> list[DataJudge | None]:
+    """What the streams themselves say of policies, one or one per replica, where there is nothing else; else none."""
+    if problem.env is not None or isinstance(experience, Simulation):
+        return []
+    return [data_judge(data, problem.prior) for data in streams_of(experience)]
 
 
 class Data(NamedTuple):

@@ -39,13 +39,14 @@ def evaluation_tags(measured: Evaluation, prefix: str = "eval") -> dict[str, flo
 
 
 def figures(measured: Evaluation) -> dict[str, float]:
-    """By name, as in ``erl_torch.log.quantities``."""
-    values = {
+    """By name, as in ``erl_torch.log.quantities``; those that there are: a log alone tells of an objective at most."""
+    found = {
         "return": measured.mean_return,
         "reward_per_step": measured.reward_per_step,
         "objective": measured.objective,
     }
-    return values if np.isnan(measured.success_rate) else {**values, "success_rate": measured.success_rate}
+    found["success_rate"] = measured.success_rate
+    return {name: value for name, value in found.items() if not np.isnan(value)}
 
 
 def optimal_tags(optimum: Solution | None, model: TabularMDP | None, problem: Problem) -> dict[str, float]:

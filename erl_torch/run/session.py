@@ -17,6 +17,7 @@ from erl_torch.checks import InputError
 from erl_torch.envs.encoded import encoded, labels_of
 from erl_torch.envs.tabular import TabularEnv
 from erl_torch.experience.experience import EXPERIENCE, Experience, permitted
+from erl_torch.experience.log import Log
 from erl_torch.experience.simulation import ReplicaExperience, Simulation, digest, longest
 from erl_torch.experience.sources import Source
 from erl_torch.experience.transitions import Transitions
@@ -42,7 +43,8 @@ from erl_torch.run.single import SingleRecorder
 from erl_torch.solution import Solution
 
 KINDS = (Simulation, list, tuple)  # of experience that replicas take besides
-Given = Problem | TabularMDP | gym.Env[Any, Any]
+Known = Problem | TabularMDP | gym.Env[Any, Any]
+Given = Known | Log
 
 
 @overload
@@ -99,9 +101,10 @@ def train(
         learner: one learner, an exact solver, or ``Replicas``.
         problem: an environment of Gymnasium's with finite spaces, a model, or a ``Problem`` of both. Where the model is
             known, policies are evaluated on it and the solution is certified; of an environment with a table ``P`` give
-            ``tabular_mdp(env)``. Of a ``Problem`` its own horizon counts.
+            ``tabular_mdp(env)``. Of a ``Problem`` its own horizon counts. Or a ``Log``, as of ``read_log``: only what
+            the data say is then written.
         experience: tuples to learn from, or a ``Source`` of them; of ``Replicas`` also one stream per replica, or a
-            ``Simulation``. None of an exact solver.
+            ``Simulation``. None of an exact solver, and of a ``Log``.
         directory: of the run; made if it is missing.
         seed: of the source, and of episodes that are played; replicas have ``seed``, ``seed + 1``, ...
         evaluation: what is measured of the policy while it learns; None is ``EvaluationSettings()``.
@@ -150,9 +153,10 @@ def _trained(
     began = time.perf_counter()
     seed = checks.at_least("seed", seed, 0)
     settings = EvaluationSettings() if evaluation is None else evaluation
+    log, known, experience = _of_log(learner, problem, experience)
     one = _checked(learner, experience, settings, checkpoint_every)
     many = isinstance(learner, Replicas)
-    given = _problem(problem, one.prior_policy, settings.horizon)
+    given = _problem(known, one.prior_policy, settings.horizon)
     learner = with_prior(learner, given.allowed)
     learner.start(given)  # raises where the learner cannot learn this problem
     checksum = None if isinstance(experience, Source) else digest(experience)
@@ -173,7 +177,7 @@ def _trained(
         experience = learner.permitted(experience, given.n_states, given.n_actions, note)
         learner.check(experience, given.n_states, given.n_actions)
         groups, vary = groups_among(learner.learners)
-        recorder = ReplicaRecorder(learner, given, experience, groups, seeds, vary, settings, title, lambda: None)
+        recorder = ReplicaRecorder(learner, given, experience, groups, seeds, vary, settings, title, lambda: None, log)
         n_experience = longest(experience)
     else:
         if isinstance(experience, Source):
@@ -185,7 +189,7 @@ def _trained(
             learner, given = as_told(learner, given)
             experience = permitted(experience, given.prior, learner.drawn_from_prior == "a_next", note)
         rng = streams(seed).evaluation
-        recorder = SingleRecorder(learner, given, experience, settings, rng, title, n_skipped)
+        recorder = SingleRecorder(learner, given, experience, settings, rng, title, n_skipped, log)
         n_experience = 0 if experience is None else len(experience)
     # Columns of tab HParams: what varies among replicas by its name, not replica by replica.
     own = {key: value for key, value in described["learner"].items() if key not in ("module", "replicas")}
@@ -205,6 +209,14 @@ def _trained(
         began=began,
     )
     return run.perform(notes)[0]
+
+
+def _of_log(learner: Any, problem: Given, experience: Any) -> tuple[Log | None, Known, Any]:
+    """The log, if ``problem`` is one; what there is to learn; what from: its own experience, if no other is given."""
+    if not isinstance(problem, Log):
+        return None, problem, experience
+    own = problem.experience if isinstance(learner, Replicas) else problem.recording
+    return problem, problem.problem, own if experience is None else experience
 
 
 def _checked(
@@ -238,11 +250,13 @@ def _checked(
     return one
 
 
-def _problem(given: Given, prior_policy: Table, horizon: int) -> Problem:
+def _problem(given: Known, prior_policy: Table, horizon: int) -> Problem:
     """As a ``Problem``, with the prior of the learner. Raises InputError."""
     if isinstance(given, Problem):
         shape = given.n_states, given.n_actions
         prior = check_policy("learner.prior_policy", prior_policy, *shape, given.allowed)
+        if given.env is None:
+            return replace(given, prior=prior)
         env, source = encoded(given.env), encoded(given.source)
         states, actions = (known or own for known, own in zip(given.names, labels_of(env), strict=True))
         return replace(

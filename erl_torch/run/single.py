@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import csv
 import functools
+import io
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,13 +21,15 @@ from erl_torch.empirical.uncertainty import Estimate
 from erl_torch.envs import grid_pictures
 from erl_torch.evaluation import Evaluation, evaluate
 from erl_torch.experience.experience import Experience
+from erl_torch.experience.log import Log
+from erl_torch.files import write_bytes
 from erl_torch.learners.learner import NonFiniteError, TabularLearner, TabularState
 from erl_torch.log.quantities import QUANTITIES, results, tagged, with_own
 from erl_torch.log.tensorboard import Board, Boards, layout
 from erl_torch.notes import note
 from erl_torch.problem import Policy, Problem
 from erl_torch.run.checkpoint import Content
-from erl_torch.run.judge import EvaluationSettings, judging_model, of_data
+from erl_torch.run.judge import DataJudge, EvaluationSettings, judging_model, of_data
 from erl_torch.run.loop import Outcome, Row
 from erl_torch.run.report import (
     Title,
@@ -43,6 +47,9 @@ from erl_torch.run.verdict import verdict
 from erl_torch.solution import Solution, proven
 from erl_torch.solvers import certify, solve_soft_bellman
 
+NO_FIGURES: dict[str, float | None] = {"reward_per_step": None, "objective": None, "return": None}
+SAID = ("reward_per_step", "objective")  # at milestones
+
 
 @dataclass(eq=False)
 class SingleRecorder:
@@ -54,6 +61,7 @@ class SingleRecorder:
         rng: draws the episodes that are played.
         title: names, for result and summary.
         n_skipped: bad tuples that were left out of the experience.
+        log: where it is all that there is.
     """
 
     learner: TabularLearner[Any]
@@ -63,6 +71,7 @@ class SingleRecorder:
     rng: np.random.Generator
     title: Title
     n_skipped: int = 0
+    log: Log | None = None
 
     def __post_init__(self) -> None:
         self.model = judging_model(self.problem, self.settings)
@@ -105,6 +114,13 @@ class SingleRecorder:
         n_states, n_actions = self.problem.prior.shape
         return reservations.count(self.experience, n_states, n_actions, next_actions, self.problem.names)
 
+    @functools.cached_property
+    def of_data(self) -> DataJudge | None:
+        """What the stream itself says of policies."""
+        if self.counts is None or self.counts.model is None:
+            return None
+        return DataJudge(self.counts.model, self.problem.prior)
+
     def _reservations(self) -> list[Reservation]:
         """What the stream does not allow the learner, and where it contradicts the model."""
         if self.counts is None:
@@ -120,6 +136,9 @@ class SingleRecorder:
     def _measure(self, policy: Policy) -> Evaluation:
         p, e = self.problem, self.settings
         exact = succeeds = None
+        if p.env is None:
+            known = np.nan if self.of_data is None else self.of_data.objective(policy.numpy(), self.learner.beta)
+            return Evaluation(np.nan, np.nan, known)
         if p.episode is not None:
             exact = functools.partial(mean_return, p.episode, p.horizon)
             if p.success is not None:
@@ -181,7 +200,8 @@ class SingleRecorder:
     def _draw(self, state: TabularState, position: int, title: str, board: Board) -> None:
         if not self.settings.pictures:
             return
-        grid, names = grid_pictures.grid_of(self.problem.env), self.problem.names
+        grid = None if self.problem.env is None else grid_pictures.grid_of(self.problem.env)
+        names = self.problem.names
         heading = f"policy, {title}" if position else title
         policy = state.policy.cpu().numpy()
         board.picture("policy", grid_pictures.policy_picture(policy, grid, heading, names=names), position)
@@ -198,7 +218,9 @@ class SingleRecorder:
             text = f"rho {row['rho']:.4e}  " if "rho" in row else ""
             text += f"theta {row['theta']:.5f}  " if "theta" in row else ""
         text += f"delta max {row['delta_max']:.4f}  " if "delta_max" in row else ""
-        return f"{text}reward per step {self.last.reward_per_step:.4f}  objective {self.last.objective:.4f}"
+        measured = figures(self.last)
+        found = [f"{name.replace('_', ' ')} {measured[name]:.4f}" for name in SAID if name in measured]
+        return "  ".join([text.rstrip(), *found]).strip()
 
     def line(self) -> str:
         return self._said
@@ -249,6 +271,8 @@ class SingleRecorder:
 
     def save(self, solution: Solution, directory: Path) -> None:
         solution.save(directory / "solution.npz")
+        if self.log is not None:
+            write_bytes(directory / "policy.csv", policy_table(solution.policy.numpy(), self.log).encode())
 
     def failed(self, solution: Solution) -> None:
         """The error has ended the run already."""
@@ -273,7 +297,7 @@ class SingleRecorder:
             "seed": self.title.seed,
             "status": solution.status.name.lower(),
             "message": solution.message,
-            **results({"theta": solution.theta, "rho": rho, "delta_max": delta_max, **figures(self.last)}),
+            **results({"theta": solution.theta, "rho": rho, "delta_max": delta_max} | NO_FIGURES | figures(self.last)),
             "theta_bounds": list(solution.theta_bounds) if solution.theta_bounds else None,
             "gap": solution.gap,
             "k": solution.k,
@@ -286,12 +310,17 @@ class SingleRecorder:
             "data_states": states_met,
             "data_half_widths": away if np.isfinite(away) else None,
             "n_skipped": self.n_skipped,
+            **({} if self.log is None else {"log": self.log.report.content()}),
         }
 
     def summary(self, result: Mapping[str, Any], directory: Path) -> str:
         of_play = "" if self.model is not None else "  (the prior's: an estimate, of the episodes played)"
-        before = {"theta": -self.first.objective, **figures(self.first)}
-        logged = {*self.start.metrics(), *before}
+        if self.problem.env is None:
+            of_play = "  (objectives and the prior's theta: of the model of the counts)"
+        before = figures(self.first)
+        if "objective" in before:
+            before = {"theta": -self.first.objective, **before}
+        logged = {*self.start.metrics(), *before, *figures(self.last)}
         rows = [
             (
                 q.row,
@@ -319,6 +348,21 @@ class SingleRecorder:
             k = "" if result["k"] is None else f" (k = {result['k']})"
             lines.append(f"{'iterations':18}{done}{k}")
         return "\n".join([*lines, *last_rows(result, directory)])
+
+
+def policy_table(policy: np.ndarray, log: Log) -> str:
+    """The policy [S, A] as CSV: a line for each action that a state has, with its label, its prior, and its visits."""
+    problem, text = log.problem, io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["state", "action", "probability", "prior", "visits"])
+    state, action = (
+        list(map(str, range(n))) if labels is None else labels.texts.tolist()
+        for n, labels in ((problem.n_states, problem.state_labels), (problem.n_actions, problem.action_labels))
+    )
+    for s, a in np.argwhere(problem.prior > 0).tolist():
+        row = float(policy[s, a]), float(problem.prior[s, a]), int(log.visits[s, a])
+        writer.writerow([state[s], action[a], *row])
+    return text.getvalue()
 
 
 def _reach_of_data(result: Mapping[str, Any]) -> str:

@@ -23,7 +23,9 @@ from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.compiled import announcement
 from erl_torch.experience.experience import Experience, permitted
+from erl_torch.experience.log import Log
 from erl_torch.experience.simulation import digest, longest
+from erl_torch.experience.sources import Source
 from erl_torch.learners.learner import TabularLearner, as_told, with_prior
 from erl_torch.learners.replicas import Replicas
 from erl_torch.learners.s1 import kernels
@@ -34,11 +36,14 @@ from erl_torch.notes import collected, note
 from erl_torch.problem import Problem
 from erl_torch.rng import streams
 from erl_torch.run.build import (
+    FromLog,
     check_sizes,
     group,
+    is_log,
     make_env,
     make_experience,
     make_learner,
+    make_log,
     make_problem,
     make_replica_experience,
     make_source,
@@ -94,17 +99,24 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
     for key in ("shared_stream", "keep_tuples"):
         if cfg[key] and not many:
             raise InputError(key, cfg[key], "left out, or used with n_replicas > 1 or vary.KEY=[...]")
-    with collected() as notes, contextlib.closing(make_env(cfg.env)) as env:
-        learner = make_learner(cfg.learner, *sizes(env))
-        prior = learner.prior_policy
-        if prior is not None:
-            prior = check_policy("learner.prior_policy", prior, *sizes(env))
-        world = make_world(cfg.env, env, safe_point, None if "beta" in cfg.vary else learner.beta, prior)
-        if world.allowed is not None:
-            learner = with_prior(learner, world.allowed)
-        problem = make_problem(cfg, env, world, learner)
+    with collected() as notes, contextlib.ExitStack() as stack:
+        log: Log | None = None
+        if is_log(cfg.env):
+            log, learner = make_log(cfg, safe_point)
+            problem = log.problem
+            print(f"{log.report}\n")
+        else:
+            env = stack.enter_context(contextlib.closing(make_env(cfg.env)))
+            learner = make_learner(cfg.learner, *sizes(env))
+            prior = learner.prior_policy
+            if prior is not None:
+                prior = check_policy("learner.prior_policy", prior, *sizes(env))
+            world = make_world(cfg.env, env, safe_point, None if "beta" in cfg.vary else learner.beta, prior)
+            if world.allowed is not None:
+                learner = with_prior(learner, world.allowed)
+            problem = make_problem(cfg, env, world, learner)
         learner, problem, experience, recorder, more = (_replicas if many else _single)(
-            cfg, learner, problem, settings, safe_point
+            cfg, learner, problem, log, settings, safe_point
         )
         run: Run[Any, Any, Any] = Run(
             learner=learner,
@@ -136,6 +148,10 @@ def plain(node: DictConfig) -> dict[str, Any]:
     return {str(key): value for key, value in values.items()}
 
 
+def _source(cfg: DictConfig, log: Log | None) -> Source:
+    return make_source(cfg.experience) if log is None else FromLog(log)
+
+
 # -- one learner --------------------------------------------------------------------------------------
 
 
@@ -143,6 +159,7 @@ def _single(
     cfg: DictConfig,
     learner: TabularLearner[Any],
     problem: Problem,
+    log: Log | None,
     settings: EvaluationSettings,
     safe_point: SafePoint,
 ) -> Parts:
@@ -150,12 +167,13 @@ def _single(
     experience: Experience | None = None
     n_skipped = 0
     if not learner.needs_model:
-        experience, n_skipped = make_experience(make_source(cfg.experience), problem, cfg.seed, safe_point)
+        experience, n_skipped = make_experience(_source(cfg, log), problem, cfg.seed, safe_point)
         learner, problem = as_told(learner, problem)
         experience = permitted(experience, problem.prior, learner.drawn_from_prior == "a_next", note)
         safe_point()
     title = Title(cfg.env.name, cfg.learner.name, cfg.seed)
-    recorder = SingleRecorder(learner, problem, experience, settings, streams(cfg.seed).evaluation, title, n_skipped)
+    rng = streams(cfg.seed).evaluation
+    recorder = SingleRecorder(learner, problem, experience, settings, rng, title, n_skipped, log)
     return learner, problem, experience, recorder, {"n_experience": 0 if experience is None else len(experience)}
 
 
@@ -166,6 +184,7 @@ def _replicas(
     cfg: DictConfig,
     learner: TabularLearner[Any],
     problem: Problem,
+    log: Log | None,
     settings: EvaluationSettings,
     safe_point: SafePoint,
 ) -> Parts:
@@ -181,11 +200,11 @@ def _replicas(
         one.start(problem)
     replicas = Replicas(tuple(learners), cfg.threads or os.cpu_count() or 1)
     seeds = [cfg.seed + i for _ in groups for i in range(cfg.n_replicas)]
-    experience = make_replica_experience(cfg, make_source(cfg.experience), problem, seeds, safe_point)
+    experience = make_replica_experience(cfg, _source(cfg, log), problem, seeds, safe_point)
     replicas, problem = as_told(replicas, problem)
     experience = replicas.permitted(experience, problem.n_states, problem.n_actions, note)
     title = Title(cfg.env.name, cfg.learner.name, cfg.seed)
-    recorder = ReplicaRecorder(replicas, problem, experience, groups, seeds, vary, settings, title, safe_point)
+    recorder = ReplicaRecorder(replicas, problem, experience, groups, seeds, vary, settings, title, safe_point, log)
     varied = {f"vary.{key}": values for key, values in vary.items()}
     sizes_told = {"n_replicas": cfg.n_replicas, "n_experience": longest(experience)}
     return replicas, problem, experience, recorder, sizes_told | varied

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from erl_torch.experience.formats import minari, npy, parquet
+from erl_torch.experience.formats import minari, npy, rows
+from erl_torch.experience.formats.format import ALLOWED as ALLOWED
 from erl_torch.experience.formats.format import Format
 
-FORMATS: tuple[Format, ...] = (minari, parquet, npy)  # npy is last: it claims all that exists
-ALLOWED = "there: an npz or Parquet file, a directory of columns, or minari:DATASET"
+FORMATS: tuple[Format, ...] = (minari, rows, npy)  # npy is last: it claims all that exists

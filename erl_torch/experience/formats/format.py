@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from types import ModuleType
 from typing import Any, NamedTuple, Protocol
 
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from erl_torch.checks import InputError
+from erl_torch.labels import Labels
 
 Batch = dict[str, np.ndarray]
 """Columns s, a, r, s_next, a_next of one length, of any type of numbers; they are checked and converted elsewhere."""
@@ -27,6 +28,12 @@ class Options(NamedTuple):
     prior_policy: ArrayLike | None = None  # [S, A], behind a'; None is uniform
     on_prior: bool = False  # the behaviour policy was the prior
     seed: int = 0  # of a' where it is drawn
+    columns: Mapping[str, Any] | None = None  # of a table: names by role (erl_torch.experience.formats.rows)
+    state_labels: Labels | None = None  # of the recorded states; None: they are numbers
+    action_labels: Labels | None = None
+
+
+ALLOWED = "there: a CSV, Parquet, JSON-lines or npz file, a directory of such parts or of columns, or minari:DATASET"
 
 
 class Reader(Protocol):

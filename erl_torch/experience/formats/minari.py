@@ -8,7 +8,7 @@ is drawn from the prior, with the stream "behaviour" of the seed, one number per
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, Protocol
 
 import gymnasium as gym
@@ -17,6 +17,7 @@ import numpy as np
 from erl_torch.checks import InputError
 from erl_torch.envs.discretise import Discretise
 from erl_torch.experience.formats.format import Batch, Options, plugin, readable
+from erl_torch.experience.formats.table import Cells, InOrder
 from erl_torch.experience.transitions import COLUMNS
 from erl_torch.labels import Labels, SpaceLabels
 from erl_torch.mdp.tabular import check_policy
@@ -140,6 +141,46 @@ class Minari:
                 f"{self.path}: action_space", data.action_space, "Discrete, or a Box that env has actions of"
             )
         return np.asarray(((x[:, None] - self._bins.actions) ** 2).sum(2).argmin(1))  # the nearest
+
+
+class Episodes(InOrder):
+    """Episodes of a local Minari data set with Discrete spaces, as a table with a row a step."""
+
+    names: Sequence[str] = ("s", "a", "r", "s_next", "terminated", "truncated", "episode")
+
+    def __init__(self, path: str) -> None:
+        self.path = path
+        self._tuples = Minari(path, Options(1, 1))._tuples
+
+    def batches(self, names: Sequence[str], rows: int, strict: bool) -> Iterator[dict[str, Cells]]:
+        minari = plugin("minari", self.path, "minari")
+        with readable(self.path, "Minari data set on this machine"):
+            data = minari.load_dataset(self.path.removeprefix(PREFIX))
+            episodes = iter(data.iterate_episodes())
+        held: list[Batch] = []
+        number = 0
+        while True:
+            with readable(self.path, f"Minari data set (from episode {number} on)"):
+                episode = next(episodes, None)
+                if episode is None:
+                    break
+                batch, terminated = self._tuples(episode, number, data)
+            n = len(batch["s"])
+            last = np.arange(n) == n - 1
+            flags = {"terminated": last & terminated, "truncated": last & (not terminated)}
+            held.append({**batch, **flags, "episode": np.full(n, number, np.int64)})
+            number += 1
+            if sum(len(one["s"]) for one in held) >= rows:
+                yield from _as_cells(held, names, rows)
+                held = []
+        yield from _as_cells(held, names, rows)
+
+
+def _as_cells(held: list[Batch], names: Sequence[str], rows: int) -> Iterator[dict[str, Cells]]:
+    if held:
+        columns = {name: np.concatenate([one[name] for one in held]) for name in names}
+        for begin in range(0, len(columns[names[0]]), rows):
+            yield {name: Cells(column[begin : begin + rows]) for name, column in columns.items()}
 
 
 def _joined(batches: list[Batch]) -> Batch:

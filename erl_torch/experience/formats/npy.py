@@ -16,7 +16,9 @@ import numpy as np
 from numpy.lib import format as npy
 
 from erl_torch.checks import InputError
-from erl_torch.experience.formats.format import Batch, Options, readable
+from erl_torch.experience.formats import rows
+from erl_torch.experience.formats.format import ALLOWED, Batch, Options, Reader, readable
+from erl_torch.experience.formats.table import of_npz
 from erl_torch.experience.transitions import COLUMNS, TYPES, Transitions
 from erl_torch.files import check_directory
 
@@ -26,8 +28,20 @@ def claims(path: str) -> bool:
     return Path(path).exists()
 
 
-def reader(path: str, options: Options) -> Columns:
+def reader(path: str, options: Options) -> Reader:
+    if Path(path).is_file():
+        if Path(path).suffix.lower() != ".npz" and not zipfile.is_zipfile(path):
+            raise InputError("path", path, ALLOWED)
+        if options.columns or options.state_labels or options.action_labels or not has_columns(path):
+            return rows.reader_of(of_npz(path), options)
     return Columns(path)
+
+
+def has_columns(path: str) -> bool:
+    """Whether an npz file has the five columns under their own names; True too of one that cannot be read."""
+    with contextlib.suppress(OSError, zipfile.BadZipFile), zipfile.ZipFile(path) as archive:
+        return set(archive.namelist()) >= {f"{name}.npy" for name in COLUMNS}
+    return True
 
 
 class Columns:

@@ -1,0 +1,747 @@
+"""Logs: every format gives the same tuples; ends, gaps and labels; what is learnt from a log alone."""
+
+import csv
+import gzip
+import io
+import json
+import os
+import re
+import runpy
+import shlex
+import sys
+from collections import defaultdict
+from itertools import pairwise
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet as pq
+import pytest
+from helpers import ROOT, composed, ended, events, scalars, undocumented
+from scipy.special import logsumexp
+
+import erl_torch
+from erl_torch import CertaintyEquivalence, EfficientS1, InputError, Replicas, read_experience, read_log
+from erl_torch.experience.formats.encoding import number_of
+from erl_torch.experience.recording import FileRecording
+from erl_torch.experience.transitions import COLUMNS
+from erl_torch.run.training import train
+
+SHOP = runpy.run_path(str(ROOT / "examples" / "shop_log.py"))
+NAMES = ("customer", "week", "segment", "offer", "profit", "left", "unwatched")
+ROLES = dict(
+    s="segment", a="offer", r="profit", episode="customer", step="week", terminated="left", truncated="unwatched"
+)
+
+
+def shop_text(n_customers=60, seed=3, forgotten=True):
+    rows = [row for row in SHOP["rows"](n_customers, seed) if forgotten or row[4] != ""]
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([NAMES, *rows])
+    return text.getvalue()
+
+
+# -- an oracle that shares no code: plain Python on the text of the file ---------------------------------------
+
+
+def by_hand(text):
+    """[(s, a, r, s')] of the shop's log, by the rules that docs/logs.md states."""
+    rows = [dict(zip(NAMES, line, strict=True)) for line in list(csv.reader(io.StringIO(text)))[1:]]
+    found = []
+    for i, row in enumerate(rows):
+        following = rows[i + 1] if i + 1 < len(rows) else rows[0]
+        same = i + 1 < len(rows) and following["customer"] == row["customer"]
+        if row["left"] == "yes":
+            s_next = following["segment"]
+        elif row["unwatched"] == "yes" or not same or int(following["week"]) != int(row["week"]) + 1:
+            continue
+        else:
+            s_next = following["segment"]
+        if row["profit"] != "":
+            found.append((row["segment"], row["offer"], float(row["profit"]), s_next))
+    return found
+
+
+def counted(tuples):
+    """(states, {(s, a): ({s': share}, mean reward)})."""
+    to, total = defaultdict(lambda: defaultdict(int)), defaultdict(list)
+    for s, a, r, s_next in tuples:
+        to[s, a][s_next] += 1
+        total[s, a].append(r)
+    pairs = {
+        pair: ({s: n / sum(seen.values()) for s, n in seen.items()}, sum(total[pair]) / len(total[pair]))
+        for pair, seen in to.items()
+    }
+    return sorted({s for s, _ in pairs}), pairs
+
+
+def solved(pairs, beta):
+    """(theta, {(s, a): probability}): relative soft value iteration on the lazy chain; prior uniform on these pairs."""
+    states = sorted({s for s, _ in pairs})
+    actions = {s: sorted(a for t, a in pairs if t == s) for s in states}
+    v = dict.fromkeys(states, 0.0)
+    q = {}
+    for _ in range(100_000):
+        q = {(s, a): r + sum(p * v[t] for t, p in to.items()) for (s, a), (to, r) in pairs.items()}
+        new = {
+            s: float(logsumexp([beta * q[s, a] for a in actions[s]]) - np.log(len(actions[s]))) / beta for s in states
+        }
+        change = [new[s] - v[s] for s in states]
+        if max(change) - min(change) < 1e-12:
+            break
+        v = {s: 0.5 * (v[s] + new[s]) - 0.5 * new[states[0]] for s in states}
+    policy = {}
+    for s in states:
+        logits = np.array([beta * q[s, a] for a in actions[s]])
+        policy |= {(s, a): float(p) for a, p in zip(actions[s], np.exp(logits - logsumexp(logits)), strict=True)}
+    return -0.5 * (max(change) + min(change)), policy
+
+
+def named(log):
+    """[(s, a, r, s')] of a log by labels."""
+    data = log.experience
+    states, actions = (
+        [str(i) for i in range(n)] if labels is None else labels.texts.tolist()
+        for n, labels in (
+            (log.n_states, log.problem.state_labels),
+            (log.n_actions, log.problem.action_labels),
+        )
+    )
+    return [
+        (states[s], actions[a], r, states[t])
+        for s, a, r, t in zip(data.s.tolist(), data.a.tolist(), data.r.tolist(), data.s_next.tolist(), strict=True)
+    ]
+
+
+def test_the_shop_by_hand(tmp_path):
+    text = shop_text(forgotten=True)
+    (tmp_path / "shop.csv").write_text(text)
+    with pytest.raises(InputError, match=r"shop.csv: r\[\d+\] \(profit\)=missing: must be a finite number"):
+        read_log(tmp_path / "shop.csv", columns=ROLES)
+    log = read_log(tmp_path / "shop.csv", columns=ROLES, on_bad="skip")
+    tuples = by_hand(text)
+    assert named(log) == tuples
+    states, pairs = counted(tuples)
+    assert log.problem.state_labels.texts.tolist() == states == ["gold", "new", "regular", "sleeping"]
+    prior = {
+        (s, a): log.problem.prior[i, j] for i, s in enumerate(states) for j, a in enumerate(["call", "mail", "nothing"])
+    }
+    assert {pair for pair, p in prior.items() if p > 0} == set(pairs)
+    theta, policy = solved(pairs, 1.0)
+    for learner in (CertaintyEquivalence(1.0), EfficientS1(1.0)):
+        learner = type(learner)(1.0, prior_policy=log.problem.prior)
+        solution = learner.fit(log.experience, log.n_states, log.n_actions)
+        assert solution.theta == pytest.approx(theta, abs=1e-6)
+        for (s, a), p in prior.items():
+            learnt = solution.policy[states.index(s), ["call", "mail", "nothing"].index(a)]
+            assert float(learnt) == pytest.approx(policy.get((s, a), 0.0), abs=1e-5), (s, a, p)
+            assert p > 0 or float(learnt) == 0
+
+
+def test_the_report_counts(tmp_path):
+    text = shop_text()
+    (tmp_path / "shop.csv").write_text(text)
+    log = read_log(tmp_path / "shop.csv", columns=ROLES, on_bad="skip")
+    rows = [dict(zip(NAMES, line, strict=True)) for line in list(csv.reader(io.StringIO(text)))[1:]]
+    tuples = by_hand(text)
+    _, pairs = counted(tuples)
+    report = log.report
+    customers = {row["customer"] for row in rows}
+    left = {row["customer"] for row in rows if row["left"] == "yes"}
+    unwatched = {row["customer"] for row in rows if row["unwatched"] == "yes"}
+    assert (report.rows, report.tuples, report.states, report.actions) == (len(rows), len(tuples), 4, 3)
+    assert (report.episodes, report.terminated, report.truncated) == (len(customers), len(left), len(unwatched))
+    assert report.cut == len(customers - left - unwatched)
+    assert report.rows == report.tuples + report.bad + report.last + report.before_gaps
+    steps = [int(b["week"]) - int(a["week"]) for a, b in pairwise(rows) if a["customer"] == b["customer"]]
+    assert report.gaps == sum(step != 1 for step in steps)
+    assert (report.pairs, report.pairs_never_seen) == (len(pairs), 2)
+    assert report.reward_range == (min(r for _, _, r, _ in tuples), max(r for _, _, r, _ in tuples))
+    assert report.mean_reward == pytest.approx(np.mean([r for _, _, r, _ in tuples]))
+    counts = defaultdict(int)
+    for s, a, _, _ in tuples:
+        counts[s, a] += 1
+    assert report.rare_pairs == sum(n < 5 for n in counts.values())
+    kinds = defaultdict(set)
+    for s, a, r, _ in tuples:
+        kinds[s, a].add(r)
+    assert report.varying_pairs == sum(len(seen) > 1 for seen in kinds.values())
+    for line in ("not answered", "there is no model and no environment", "2 pairs (s,a) would bring", "10 of 12 seen"):
+        assert line in str(report)
+
+
+# -- ends, in random logs ------------------------------------------------------------------------------------
+
+
+def reference(rows, s_next, episode, terminated, truncated, step):
+    """[(s, a, r, s')] of rows (dicts) where the columns named are there: one row at a time."""
+    found = []
+    for i, row in enumerate(rows):
+        after = rows[i + 1] if i + 1 < len(rows) else None
+        end = after is None or (episode and after["episode"] != row["episode"])
+        end = end or (terminated and row["terminated"]) or (truncated and row["truncated"])
+        if terminated and row["terminated"]:
+            to = (after or rows[0])["s"]
+        elif s_next:
+            to = row["s_next"]
+        elif end or (step and after["step"] != row["step"] + 1):
+            continue
+        else:
+            to = after["s"]
+        found.append((row["s"], row["a"], row["r"], to))
+    return found
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_random_logs(seed):
+    rng = np.random.default_rng(seed)
+    there = {name: bool(rng.random() < 0.5) for name in ("s_next", "episode", "terminated", "truncated", "step")}
+    if not (there["s_next"] or there["episode"] or there["terminated"] or there["truncated"]):
+        there["episode"] = True
+    n, episode, step = 300, 0, 0
+    rows = []
+    for _ in range(n):
+        s, a, s_next = (f"s{rng.integers(4)}", f"a{rng.integers(3)}", f"s{rng.integers(4)}")
+        row = dict(s=s, a=a, r=float(rng.normal()), s_next=s_next,
+                   terminated=bool(rng.random() < 0.1), truncated=bool(rng.random() < 0.1))  # fmt: skip
+        row |= dict(episode=episode, step=step)
+        step += 1 if rng.random() < 0.9 else 3
+        if row["terminated"] or row["truncated"] or rng.random() < 0.05:
+            episode, step = episode + 1, 0
+        rows.append(row)
+    names = ["s", "a", "r", *(name for name, used in there.items() if used)]
+    frame = {name: [row[name] for row in rows] for name in names}
+    log = read_log(frame)
+    assert named(log) == reference(rows, **there)
+    for chunk in (1, 7):
+        pieces = read_log(frame, chunk=chunk)
+        assert isinstance(pieces.experience, FileRecording)
+        assert pieces.experience.checksum() == log.experience.checksum()
+
+
+def test_episodes_that_are_mixed_are_put_together():
+    rows = [("x", 0, "p"), ("y", 0, "q"), ("x", 1, "r"), ("y", 1, "p"), ("z", 0, "q"), ("x", 2, "p"), ("z", 1, "p")]
+    frame = dict(episode=[e for e, _, _ in rows], t=[t for _, t, _ in rows], s=[s for _, _, s in rows],
+                 a=[0, 1] * 3 + [0], r=[0.0, 1, 2, 3, 4, 5, 6], done=[0, 0, 0, 1, 0, 1, 1])  # fmt: skip
+    log = read_log(frame)
+    # x: rows 0, 2, 5; y: 1, 3; z: 4, 6. Each ends by terminating: s' is the first state of the next in this order.
+    assert named(log) == [
+        ("p", "0", 0.0, "r"), ("r", "0", 2.0, "p"), ("p", "1", 5.0, "q"), ("q", "1", 1.0, "p"), ("p", "1", 3.0, "q"),
+        ("q", "0", 4.0, "p"), ("p", "0", 6.0, "p"),
+    ]  # fmt: skip
+    frame["r"] = [0.0, 1, 2, None, 4, 5, 6]  # named by its place in the file
+    with pytest.raises(InputError, match=r"r\[3\]=missing"):
+        read_log(frame)
+
+
+def test_a_next_is_drawn_from_the_prior_that_lacks_what_is_never_seen():
+    rng = np.random.default_rng(0)
+    n = 30_000
+    s = rng.integers(3, size=n)
+    a = np.where(s == 0, rng.integers(2, size=n), rng.integers(3, size=n))  # 0 has not the third action
+    frame = dict(s=s, a=a, r=rng.normal(size=n), s_next=rng.integers(3, size=n))
+    data = read_log(frame, seed=5).experience
+    counts = np.zeros((3, 3))
+    np.add.at(counts, (data.s_next, data.a_next), 1)
+    prior = np.array([[0.5, 0.5, 0], [1 / 3] * 3, [1 / 3] * 3])
+    expected = counts.sum(1, keepdims=True) * prior
+    assert counts[0, 2] == 0
+    used = expected > 0
+    assert ((counts - expected)[used] ** 2 / expected[used]).sum() < 25  # chi-square, 5 degrees of freedom: 1.4e-4
+    assert np.array_equal(read_log(frame, seed=5, chunk=999).recording.load().a_next, data.a_next)
+    assert not np.array_equal(read_log(frame, seed=6).experience.a_next, data.a_next)
+    everywhere = read_log(frame, unseen_actions="allowed")
+    assert np.allclose(everywhere.problem.prior, 1 / 3)
+    own = np.array([[0.9, 0.1, 0.0]] * 3)
+    drawn = read_log(frame, prior_policy=own).experience.a_next
+    assert set(drawn.tolist()) == {0, 1}
+    assert abs(drawn.mean() - 0.1) < 5 * np.sqrt(0.09 / n)
+
+
+# -- formats ---------------------------------------------------------------------------------------------------
+
+
+class OnlyArrow:
+    """A frame of which nothing is known but Arrow's interface."""
+
+    def __init__(self, table):
+        self._table = table
+
+    def __arrow_c_stream__(self, requested_schema=None):
+        return self._table.__arrow_c_stream__(requested_schema)
+
+
+def columns_of(text):
+    header, *lines = csv.reader(io.StringIO(text))
+    typed = {
+        name: [int(x) if name in ("customer", "week") else float(x) if name == "profit" else x for x in column]
+        for name, column in zip(header, zip(*lines, strict=True), strict=True)
+    }
+    return typed | {name: [x == "yes" for x in typed[name]] for name in ("left", "unwatched")}
+
+
+def packed(path, data):
+    with gzip.open(path, "wb") as file:
+        file.write(data)
+
+
+def lines_of(table):
+    return "".join(json.dumps(row) + "\n" for row in table.to_pylist()).encode()
+
+
+def parts(folder, table, write, suffix):
+    folder.mkdir()
+    for i, begin in enumerate(range(0, len(table), 40)):
+        write(table.slice(begin, 40), folder / f"part.{i}{suffix}")  # part.10 comes after part.9
+    (folder / "_SUCCESS").touch()
+
+
+WRITE = {
+    "log.csv": lambda path, text, table: path.write_text(text),
+    "LOG.CSV": lambda path, text, table: path.write_text(text),
+    "windows.csv": lambda path, text, table: path.write_bytes(b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode()),
+    "spaces.csv": lambda path, text, table: path.write_text(text.replace(",", " , ")),
+    "quoted.csv": lambda path, text, table: path.write_text(re.sub(r"[^,\n]+", r'"\g<0>"', text)),
+    "log.csv.gz": lambda path, text, table: packed(path, text.encode()),
+    "log.tsv": lambda path, text, table: path.write_text(text.replace(",", "\t")),
+    "tabs.csv": lambda path, text, table: path.write_text(text.replace(",", "\t")),
+    "european.csv": lambda path, text, table: path.write_text(text.replace(",", ";").replace(".", ",")),
+    "log.jsonl": lambda path, text, table: path.write_bytes(lines_of(table)),
+    "log.ndjson.gz": lambda path, text, table: packed(path, lines_of(table)),
+    "log.parquet": lambda path, text, table: pq.write_table(table, path, row_group_size=33),
+    "log.pq": lambda path, text, table: pq.write_table(table, path),
+    "LOG.PARQUET": lambda path, text, table: pq.write_table(table, path),
+    "categories.pq": lambda path, text, table: pq.write_table(
+        table.set_column(2, "segment", table["segment"].dictionary_encode()), path
+    ),
+    "parts.parquet": lambda path, text, table: parts(path, table, pq.write_table, ".parquet"),
+    "parts": lambda path, text, table: parts(path, table, pa.csv.write_csv, ".csv"),
+    "log.npz": lambda path, text, table: np.savez(path, **{n: np.array(x) for n, x in columns_of(text).items()}),
+}  # fmt: skip
+FRAMES = {
+    "dict": lambda text, table: columns_of(text),
+    "arrow": lambda text, table: table,
+    "capsule": lambda text, table: OnlyArrow(table),
+    "pandas": lambda text, table: pytest.importorskip("pandas").DataFrame(columns_of(text)),
+    "polars": lambda text, table: pytest.importorskip("polars").DataFrame(columns_of(text)),
+}
+
+
+@pytest.fixture(scope="module")
+def whole():
+    text = shop_text(forgotten=False)
+    return text, pa.table(columns_of(text)), by_hand(text)
+
+
+@pytest.mark.parametrize("name", [*WRITE, *FRAMES])
+def test_every_format_gives_the_same_tuples(tmp_path, whole, name):
+    text, table, tuples = whole
+    if name in WRITE:
+        place = tmp_path / name
+        WRITE[name](place, text, table)
+    else:
+        place = FRAMES[name](text, table)
+    log = read_log(place, columns=ROLES)
+    assert named(log) == tuples
+    expected = read_log(columns_of(text), columns=ROLES)
+    assert log.experience.checksum() == expected.experience.checksum()
+    cut = read_log(place, columns=ROLES, chunk=7).recording
+    assert (len(cut), cut.checksum()) == (len(tuples), expected.experience.checksum())
+    assert cut.load().checksum() == cut.checksum()
+
+
+@pytest.mark.parametrize("name", ["tuples.csv", "tuples.jsonl", "tuples.pq", "tuples.npz", "tuples"])
+def test_the_five_columns_are_a_log_too(tmp_path, name):
+    """With the sizes given and without, from our own files and others'."""
+    data = erl_torch.collect(erl_torch.TabularMDP(np.full((4, 2, 4), 0.25), np.arange(8.0).reshape(4, 2)), 3, 200, 1)
+    table = pa.table({column: getattr(data, column) for column in COLUMNS})
+    path = tmp_path / name
+    if name == "tuples":
+        erl_torch.write_experience(data, path)
+    elif name == "tuples.npz":
+        data.save(path)
+    elif name == "tuples.pq":
+        pq.write_table(table, path)
+    elif name == "tuples.jsonl":
+        path.write_bytes(lines_of(table))
+    else:
+        pa.csv.write_csv(table, path)
+    assert read_experience(path, 4, 2).checksum() == data.checksum()
+    log = read_log(path)
+    assert log.experience.checksum() == data.checksum()
+    assert log.problem.state_labels is log.problem.action_labels is None
+
+
+def test_names_of_other_programs(tmp_path):
+    """D4RL's arrays; Gymnasium's names; states of several numbers."""
+    np.savez(tmp_path / "d4rl.npz", observations=[[0.0], [1.0], [2.0], [0.0]], actions=[1.0, 0.0, 1.0, 1.0],
+             rewards=np.arange(4, dtype=np.float32), terminals=[False, True, False, False],
+             timeouts=[False, False, False, True])  # fmt: skip
+    log = read_log(tmp_path / "d4rl.npz")
+    assert named(log) == [("0", "1", 0.0, "1"), ("1", "0", 1.0, "2"), ("2", "1", 2.0, "0")]
+    assert log.problem.state_labels is None
+    assert log.report.last == 1
+    frame = {
+        "Observation": [(0, 1), (2, 3)],
+        "Next Observation": [(2, 3), (0, 1)],
+        "ACTION": ["l", "r"],
+        "Reward": [1, 2],
+    }
+    log = read_log(frame)
+    assert list(log.problem.state_labels) == [(0, 1), (2, 3)]
+    frame = dict(x=[0, 2], y=["a", "b"], x2=[2, 0], y2=["b", "a"], a=[0, 1], r=[1, 2])
+    log = read_log(frame, columns={"s": ["x", "y"], "s_next": ["x2", "y2"]})
+    assert list(log.problem.state_labels) == [(0, "a"), (2, "b")]
+    assert named(log) == [("(0, 'a')", "0", 1.0, "(2, 'b')"), ("(2, 'b')", "1", 2.0, "(0, 'a')")]
+
+
+def test_done_where_time_limits_are_told_too():
+    """``done`` of older programs is true at both; ``terminated`` beside ``truncated`` is an end."""
+    frame = dict(s=["p", "q", "p"], a=[0, 0, 0], r=[1, 2, 3], s_next=["q", "z", "q"], truncated=[0, 1, 0])
+    assert named(read_log(frame | dict(done=[0, 1, 1])))[1] == ("q", "0", 2.0, "z")
+    assert named(read_log(frame | dict(terminated=[0, 1, 1])))[1] == ("q", "0", 2.0, "p")
+
+
+@pytest.mark.parametrize(
+    ("values", "labels"),
+    [
+        ([3, 1, 2], ["1", "2", "3"]),
+        ([0, 1, 2], None),
+        ([2.0, 0.0, 1.0], None),
+        (["2", "0", "1.0"], None),
+        (["10", "9", "x"], ["9", "10", "x"]),
+        (["007", "7", "8"], ["7", "8", "007"]),
+        ([0.5, 10.25, 2.5], ["0.5", "2.5", "10.25"]),
+        ([True, False, True], ["False", "True"]),
+        ([1, "1", "é"], ["1", "é"]),
+        (["NA", "EU", "US"], ["EU", "NA", "US"]),
+        ([-1, 0, 1], ["-1", "0", "1"]),
+    ],
+)
+def test_labels_are_judged_by_the_whole_column(values, labels):
+    log = read_log(dict(s=values, a=[0, 1, 0], r=[1, 2, 3], s_next=values[1:] + values[:1]))
+    found = log.problem.state_labels
+    assert (None if found is None else sorted(found.texts.tolist(), key=lambda x: (number_of(x) is None, x))) == (
+        None if labels is None else sorted(labels, key=lambda x: (number_of(x) is None, x))
+    )
+    if labels is not None:
+        assert found.texts.tolist() == labels
+
+
+def test_types_are_judged_by_the_column_not_its_first_batch(tmp_path):
+    """A first text after a million characters of numbers; floats after whole numbers; a first null."""
+    n = 400_000
+    lines = [f"{i % 3},{i % 2},{i % 5}\n" for i in range(n)]
+    (tmp_path / "long.csv").write_text("s,a,r,done\n" + "".join(line[:-1] + ",0\n" for line in lines) + "x,1,0.25,1\n")
+    log = read_log(tmp_path / "long.csv")
+    assert log.problem.state_labels.texts.tolist() == ["0", "1", "2", "x"]
+    assert log.experience.r[-1] == 0.25
+    assert len(log.experience) == n + 1
+
+
+# -- hostile files -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("empty.csv", b"", "must be a readable CSV file"),
+        ("header.csv", b"s,a,r,done\n", "no row: must be at least one row"),
+        ("one.csv", b"s,a,r,done\n0,0,1,0\n", "0 good tuples"),
+        ("ragged.csv", b"s,a,r,done\n0,0,1,0\n0,0\n", r"readable CSV file.*Expected 4 columns, got 2"),
+        ("names.csv", b"x,y,z\n0,0,1\n", "s=missing: must be a column named s, state, .*the columns are x, y, z"),
+        ("twice.csv", b"s,state,a,r,done\n0,0,0,1,1\n", "s=s and state: must be one column: say which, columns.s=NAME"),
+        ("same.csv", b"s,s,a,r,done\n0,0,0,1,1\n", "s=s and s: must be one column"),
+        ("ends.csv", b"s,a,r\n0,0,1\n", "s_next=missing: must be a column, or else one that tells the episodes"),
+        ("text.csv", b"s,a,r,done\n0,0,1,0\n0,0,much,1\n", r"r\[1\]=much: must be a finite number"),
+        ("inf.csv", b"s,a,r,done\n0,0,inf,1\n", r"r\[0\]=inf: must be a finite number"),
+        ("digits.csv", b"s,a,r,done\n0,0,1_0,1\n", r"r\[0\]=1_0: must be a finite number"),
+        ("flag.csv", b"s,a,r,done\n0,0,1,maybe\n", r"terminated\[0\] \(done\)=maybe: must be true or false"),
+        ("noflag.csv", b"s,a,r,done\n0,0,1,\n", r"terminated\[0\] \(done\)=missing: must be true or false"),
+        ("lost.csv", b"s,a,r,done\nx,0,1,0\n,0,1,1\n", r"s\[1\]=missing: must be one of x"),
+        ("down.csv", b"episode,t,s,a,r\n1,3,0,0,1\n1,2,1,0,1\n1,1,0,0,1\n", "t=steps of -1: must be in order of time"),
+        ("latin.csv", "s,a,r,done\né,0,1,1\n".encode("latin-1"), "must be a readable CSV file"),
+        ("cut.csv.gz", gzip.compress(b"s,a,r,done\n" + b"0,0,1,1\n" * 9000)[:40], "must be a readable CSV file"),
+        ("none.csv.gz", b"s,a,r,done\n0,0,1,1\n", "must be a readable CSV file"),
+        ("text.jsonl", b'{"s":0,"a":0,"r":1,"done":true}\nnothing\n', "line 2=nothing: must be a JSON object"),
+        ("list.jsonl", b"[1,2]\n", r"line 1=\[1,2\]: must be a JSON object"),
+        ("short.jsonl", b'{"s":0,"a":0,"r":1,"done":true}\n{"s":0,"a":0,"r":1}\n', r"terminated\[1\] \(done\)=missing"),
+        ("empty.jsonl", b"", "s=missing"),
+        ("broken.parquet", b"PAR1nothing", "must be a readable Parquet file"),
+        ("broken.npz", b"PK\x03\x04", "must be a readable npz file"),
+        ("log.txt", b"s,a,r\n", "must be there: a CSV, Parquet, JSON-lines or npz file"),
+    ],
+)
+def test_one_line_for_what_cannot_be_read(tmp_path, name, content, said):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError, match=said) as error:
+        read_log(tmp_path / name)
+    assert "\n" not in str(error.value)
+    assert name in str(error.value)
+
+
+def test_bad_rows_are_left_out_and_counted(tmp_path):
+    path = tmp_path / "t.csv"
+    path.write_text("episode,s,a,r\n1,x,0,1\n1,y,0,\n1,,0,2\n1,x,1\n1,x,1,3\n1,y,0,4\n1,x,0,5\n")
+    log = read_log(path, on_bad="skip")
+    # The row before the one whose state is missing has no state after; of a row of three columns nothing is known.
+    assert named(log) == [("x", "0", 1.0, "y"), ("x", "1", 3.0, "y"), ("y", "0", 4.0, "x")]
+    assert (log.report.bad, log.report.last) == (3, 1)
+    assert log.report.first_bad == "r[1]=missing"
+    assert log.recording.n_skipped == 3
+
+
+def test_other_refusals(tmp_path):
+    frame = dict(s=[0, 1], a=[0, 1], r=[1, 2], done=[0, 1])
+    for columns, said in (
+        ({"q": "s"}, "columns.q=s: must be left out: no such column; there are s, a, r"),
+        ({"s": "x"}, "columns.s=x: must be a column of dict; the columns are s, a, r, done"),
+        ({"r": ["s", "r"]}, "columns.r="),
+        ({"s": None}, "s=missing"),
+        ({"s": ["s", "done"], "s_next": "s"}, "columns.s_next=s: must be 2 columns, as columns.s has"),
+        ({"a": []}, "columns.a="),
+    ):
+        with pytest.raises(InputError, match=re.escape(said)):
+            read_log(frame, columns=columns)
+    with pytest.raises(InputError, match=r"columns\.step=when: must be a counter"):
+        read_log(frame | dict(when=[5, 5]), columns={"step": "when"})
+    with pytest.raises(InputError, match="unseen_actions=some: must be missing or allowed"):
+        read_log(frame, unseen_actions="some")
+    with pytest.raises(InputError, match="lengths"):
+        read_log(frame | {"r": [1, 2, 3]})
+    with pytest.raises(InputError, match="path=int: must be a path, a frame"):
+        read_log(3)
+    with pytest.raises(InputError, match="cut into bins first: it has 1,500 different values"):
+        read_log(dict(s=(np.arange(1500) + 0.5), a=np.zeros(1500), r=np.zeros(1500), done=np.zeros(1500)))
+    (tmp_path / "d").mkdir()
+    (tmp_path / "d" / "a.csv").write_text("s,a,r,done\n0,0,1,1\n")
+    (tmp_path / "d" / "b.csv").write_text("s,a,done\n0,0,1\n")
+    with pytest.raises(InputError, match=r"b\.csv: columns=s, a, done: must be of the columns of a\.csv"):
+        read_log(tmp_path / "d")
+    (tmp_path / "d" / "year=1").mkdir()
+    with pytest.raises(InputError, match="a directory of parts of one format, and of nothing else: it has year=1"):
+        read_log(tmp_path / "d")
+
+
+def test_a_log_whose_sizes_are_given(tmp_path):
+    """With an environment its numbers count, and what is out of range is named."""
+    path = tmp_path / "t.csv"
+    path.write_text("s,a,r,s_next\n0,0,1,1\n1.0,1,2,0\n")
+    data = read_experience(path, 2, 2)
+    assert [data.s.tolist(), data.a.tolist(), data.s_next.tolist()] == [[0, 1], [0, 1], [1, 0]]
+    for size, said in (((1, 2), r"s_next\[0\]=1: must be a whole number in \[0, 1\)"), ((2, 1), r"a\[1\]=1")):
+        with pytest.raises(InputError, match=said):
+            read_experience(path, *size)
+    labels = erl_torch.labels.Labels.of_values(["x", "y"])
+    path.write_text("s,a,r,s_next\nx,0,1,y\ny,1,2,x\n")
+    with pytest.raises(InputError, match=r"s\[0\]=x: must be a whole number in \[0, 2\)"):
+        read_experience(path, 2, 2)
+    assert read_experience(path, 2, 2, state_labels=labels).s.tolist() == [0, 1]
+    path.write_text("s,a,r,s_next\nx,0,1,z\n")
+    with pytest.raises(InputError, match=r"s_next\[0\]=z: must be one of x, y"):
+        read_experience(path, 2, 2, state_labels=labels)
+
+
+# -- runs ----------------------------------------------------------------------------------------------------------
+
+SHORT = ("learner.n_bias=2", "learner.n_epochs=2", "learner.beta=1")
+COLUMNS_TYPED = "experience.columns={" + ", ".join(f"{role}: {name}" for role, name in ROLES.items()) + "}"
+
+
+@pytest.fixture
+def shop(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "shop.csv").write_text(shop_text(200, 1))
+    return ("experience=recorded", "experience.path=shop.csv", "++" + COLUMNS_TYPED, "experience.on_bad=skip")
+
+
+@pytest.mark.parametrize("learner", ["s1", "s1_efficient", "certainty_equivalence", "differential_soft_q"])
+def test_a_run_says_what_the_data_say_and_no_more(tmp_path, shop, capsys, learner):
+    few = () if learner == "certainty_equivalence" else ("learner.n_epochs=3",)
+    result = train(composed(*shop, f"learner={learner}", "learner.beta=1", *few), tmp_path / "run")
+    out = capsys.readouterr().out
+    assert out.startswith("log               shop.csv: ")
+    assert out.index("not answered") < out.index(f"log, {learner}, beta 1, seed 0: ")
+    assert "windy" not in out
+    assert "proven" not in out.split("seed 0:")[1]
+    assert "return" not in out.split("seed 0:")[1]
+    for key in ("theta_bounds", "gap", "return", "reward_per_step"):
+        assert result[key] is None, key
+    assert json.loads((tmp_path / "run" / "result.json").read_text())["log"]["states"] == 4
+    tags = scalars(tmp_path / "run")
+    assert not [tag for tag in tags if re.match(r"optimal/|.*(return|reward_per_step)", tag)]
+    assert undocumented(tmp_path / "run") == set()
+    assert events(tmp_path / "run").Images("policy")
+    theta, policy = solved(counted(by_hand((tmp_path / "shop.csv").read_text()))[1], 1.0)
+    if learner in ("s1_efficient", "certainty_equivalence"):
+        assert result["theta"] == pytest.approx(theta, abs=1e-5)
+        assert result["objective"] == pytest.approx(-theta, abs=1e-5)
+    else:
+        assert result["objective"] <= -theta + 1e-9  # of the model of the counts, its best is -theta
+    table = list(csv.reader((tmp_path / "run" / "policy.csv").read_text().splitlines()))
+    assert table[0] == ["state", "action", "probability", "prior", "visits"]
+    assert {(s, a) for s, a, *_ in table[1:]} == set(policy)
+    if learner == "certainty_equivalence":
+        assert {(s, a): pytest.approx(float(p), abs=1e-6) for s, a, p, *_ in table[1:]} == policy
+
+
+def test_the_prior_of_the_counts(tmp_path, shop):
+    """The objective of the prior policy, by the stationary distribution of the counted chain."""
+    train(composed(*shop, *SHORT, "evaluation.pictures=false"), tmp_path / "run")
+    states, pairs = counted(by_hand((tmp_path / "shop.csv").read_text()))
+    share = np.full(len(states), 1 / len(states))
+    chain, reward = np.zeros((len(states), len(states))), np.zeros(len(states))
+    for i, s in enumerate(states):
+        own = [pair for pair in pairs if pair[0] == s]
+        for pair in own:
+            reward[i] += pairs[pair][1] / len(own)
+            for to, p in pairs[pair][0].items():
+                chain[i, states.index(to)] += p / len(own)
+    for _ in range(3000):
+        share = share @ chain
+    assert scalars(tmp_path / "run")["eval/objective"][0][1] == pytest.approx(float(share @ reward), rel=1e-5)
+
+
+def test_what_is_missing_may_be_allowed(tmp_path, shop):
+    result = train(
+        composed(*shop, "env.unseen_actions=allowed", "learner=s1_efficient", "learner.beta=1"), tmp_path / "run"
+    )
+    assert result["log"]["unseen_actions"] == "allowed"
+    table = list(csv.reader((tmp_path / "run" / "policy.csv").read_text().splitlines()))
+    assert len(table) == 1 + 4 * 3
+    assert {row[3] for row in table[1:]} == {str(1 / 3)}
+
+
+def test_a_log_resumes_sweeps_and_varies(tmp_path, shop, typed_here):
+    typed = [*(word.removeprefix("++") for word in shop), "learner.beta=1", "evaluation.pictures=false"]
+    code, _, err = typed_here("train.py", *typed, *SHORT, "hydra.run.dir=whole")
+    assert code == 0, err
+    whole = json.loads((tmp_path / "whole" / "result.json").read_text())
+    solution = (tmp_path / "whole" / "solution.npz").read_bytes()
+    result = json.loads((tmp_path / "whole" / "result.json").read_text())
+    (tmp_path / "whole" / "result.json").unlink()  # as if it had been killed at the end
+    code, _, err = typed_here("train.py", "resume=whole")
+    assert code == 0, err
+    again = json.loads((tmp_path / "whole" / "result.json").read_text())
+    assert {k: again[k] for k in ("theta", "log", "objective")} == {k: result[k] for k in ("theta", "log", "objective")}
+    assert (tmp_path / "whole" / "solution.npz").read_bytes() == solution
+    code, _, err = typed_here("train.py", "-m", *typed, "learner=s1", "learner.n_bias=1", "learner.n_epochs=1",
+                              "learner.lr_u=0.01,0.02", "hydra.sweep.dir=sweep")  # fmt: skip
+    assert code == 0, err
+    assert len(list((tmp_path / "sweep").glob("*/policy.csv"))) == 2
+    code, _, err = typed_here("train.py", *typed, *SHORT, "vary.beta=[1,2]", "hydra.run.dir=many")
+    assert code == 0, err
+    many = json.loads((tmp_path / "many" / "result.json").read_text())
+    assert many["groups"][0]["theta"]["mean"] == whole["theta"]
+    assert many["groups"][0]["objective"]["mean"] == pytest.approx(whole["objective"], rel=1e-12)
+    assert many["log"] == whole["log"]
+    code, _, err = typed_here("play.py", "run=whole")
+    assert (code, err.count("\n")) == (1, 1)
+    assert "a log alone has none to play in; its policy is in whole/policy.csv" in err
+
+
+@pytest.mark.parametrize(
+    ("typed", "said"),
+    [
+        (("learner=exact",), "learner=exact: must be one that learns from experience: a log has no model to solve"),
+        (("n_replicas=2",), "n_replicas=2: must be 1: on one stream"),
+        (("env.wind_strength=0.5",), "env.wind_strength=0.5: no such key; there are "),
+        (("env.unseen_actions=maybe",), "env.unseen_actions=maybe: must be missing or allowed"),
+        (
+            ("experience.columns.s=colour",),
+            "experience.columns.s=colour: must be a column of shop.csv; the columns are",
+        ),
+        (("experience.on_bad=stop",), r"experience.path=shop.csv: r\["),
+        (("learner.prior_policy=p.npy",), "learner.prior_policy=array of shape (2, 2): must be of shape [4, 3]"),
+        (("env=windy_cliff",), "experience.path=shop.csv: s[0] (segment)=new: must be a whole number in [0, 15)"),
+    ],
+)
+def test_complaints(tmp_path, shop, typed_here, typed, said):
+    np.save(tmp_path / "p.npy", np.full((2, 2), 0.5))
+    words = [word.removeprefix("++") for word in shop if not word.startswith("experience.on_bad")]
+    words.append("experience.on_bad=skip")
+    code, _, err = typed_here("train.py", *words, *typed, "hydra.run.dir=run")
+    if "on_bad" in typed[0]:
+        assert re.search(said, err)
+    elif "env=windy_cliff" not in typed:
+        assert err.startswith(f"error: {said}"), err
+    assert (code, not (tmp_path / "run").exists()) == (1, True)
+    assert err.count("\n") == 1
+
+
+def test_env_log_learns_from_recordings_alone(tmp_path, typed_here):
+    code, _, err = typed_here("train.py", "env=log", "hydra.run.dir=run")
+    assert code == 1
+    assert err == "error: experience=simulate: must be recorded: env=log has no environment to collect from\n"
+    code, _, err = typed_here("compare.py", "env=log", "seeds=1", "hydra.run.dir=run")
+    assert (code, err.count("\n")) == (1, 1)
+
+
+def test_from_python(tmp_path):
+    text = shop_text(200, 1)
+    (tmp_path / "shop.csv").write_text(text)
+    log = read_log(tmp_path / "shop.csv", columns=ROLES, on_bad="skip")
+    theta, _ = solved(counted(by_hand(text))[1], 1.0)
+    with pytest.warns(erl_torch.Note, match="bad tuples"):
+        solution = erl_torch.train(EfficientS1(1.0), log, directory=tmp_path / "run")
+    assert solution.theta == pytest.approx(theta, abs=1e-5)
+    assert solution.theta_bounds is solution.gap is None
+    assert json.loads((tmp_path / "run" / "result.json").read_text())["log"]["tuples"] == len(log.experience)
+    assert (tmp_path / "run" / "policy.csv").is_file()
+    again = erl_torch.train(EfficientS1(1.0), log.problem, log.experience, directory=tmp_path / "other")
+    assert again.theta == solution.theta
+    many = Replicas.of(EfficientS1(1.0), beta=[1.0, 2.0])
+    found = erl_torch.train(many, log, directory=tmp_path / "many")
+    assert found.theta[0] == pytest.approx(theta, abs=1e-5)
+    assert len(found) == 2
+
+
+@pytest.mark.slow
+def test_the_page_in_three_commands(tmp_path, start):
+    """The commands of docs/logs.md as typed, and the truth behind the shop inside what the data say."""
+    page = (ROOT / "docs" / "logs.md").read_text()
+    block = re.search(r"```sh\n(.*?)```", page, re.S)[1].replace("\\\n", " ")
+    commands = [line for line in block.splitlines() if line.strip()]
+    assert len(commands) == 3
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    printed = []
+    for command in commands:
+        words = shlex.split(command)
+        if words[0] == "erl-torch":
+            words = [sys.executable, "-m", "erl_torch.cli.commands", *words[1:]]
+        elif words[0] == "python":
+            words[0] = sys.executable
+        code, out, err = ended(start(*words, cwd=tmp_path, env={**os.environ, "PYTHONPATH": path}))
+        assert code == 0, err
+        printed.append(out)
+    shown = re.findall(r"```text\n(.*?)```", page, re.S)
+    assert len(shown) == 3
+    for text, out in zip(shown, printed, strict=True):  # in the same order
+        lines = [line.rstrip() for line in text.splitlines() if line.strip()]
+        assert [line.rstrip() for line in out.splitlines() if line.rstrip() in lines] == lines
+    result = json.loads((tmp_path / "runs" / "shop" / "result.json").read_text())
+    theta, policy = solved(truth(), 1.0)
+    value, half = map(float, re.fullmatch(r"theta = (\S+) \+- (\S+)", result["data"]).groups())
+    assert abs(value - theta) <= half
+    learnt = {(s, a): float(p) for s, a, p, *_ in csv.reader(printed[2].splitlines()[1:])}
+    best = {s: max((p, a) for (t, a), p in policy.items() if t == s)[1] for s, _ in policy}
+    assert {s: max((p, a) for (t, a), p in learnt.items() if t == s)[1] for s in best} == best
+    assert f"is {-theta:.2f}. The" in page
+
+
+def truth():
+    """The shop as its example describes it, {(s, a): ({s': chance}, mean profit)}: a new one comes after who leaves."""
+    order = SHOP["SEGMENTS"]
+    pairs = {}
+    for s in order:
+        for a in SHOP["offers_of"](s):
+            up, i = SHOP["OFFERS"][a], order.index(s)
+            stays = 1 - (SHOP["LEAVES"] if s == "sleeping" else 0)
+            to = defaultdict(float)
+            to["new"] += 1 - stays
+            to[order[min(i + 1, 3)]] += stays * up
+            to[order[max(i - 1, 0)]] += stays * (1 - up) / 2
+            to[s] += stays * (1 - up) / 2
+            pairs[s, a] = (dict(to), SHOP["SALES"][s] - SHOP["COSTS"][a])
+    return pairs
