@@ -42,6 +42,7 @@ _PUBLIC = {
     "run.session": "train",
     "solution": "Solution Status",
     "solvers": "certify iterate_biasing perron solve_biasing solve_soft_bellman",
+    "solvers.charge": "Charge smallest_charge",
     "solvers.discounted": "solve_discounted",
     "solvers.episodes": "EpisodeFigures evaluate_episodes",
     "solvers.finite_horizon": "solve_finite_horizon",
