@@ -33,7 +33,7 @@ _PUBLIC = {
     "learners.replicas": "Replicas ReplicaSolution",
     "learners.s1.algorithm": "AlgorithmS1 ListedS1 S1State",
     "labels": "Labels",
-    "mdp.from_gymnasium": "MeanRewardWarning tabular_mdp",
+    "mdp.from_gymnasium": "MeanRewardWarning model_ends tabular_mdp",
     "mdp.masks": "ActionMasks",
     "mdp.tabular": "TabularMDP",
     "notes": "Note",

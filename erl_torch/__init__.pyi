@@ -33,6 +33,7 @@ from erl_torch.learners.s1.algorithm import AlgorithmS1 as AlgorithmS1
 from erl_torch.learners.s1.algorithm import ListedS1 as ListedS1
 from erl_torch.learners.s1.algorithm import S1State as S1State
 from erl_torch.mdp.from_gymnasium import MeanRewardWarning as MeanRewardWarning
+from erl_torch.mdp.from_gymnasium import model_ends as model_ends
 from erl_torch.mdp.from_gymnasium import tabular_mdp as tabular_mdp
 from erl_torch.mdp.masks import ActionMasks as ActionMasks
 from erl_torch.mdp.tabular import TabularMDP as TabularMDP
