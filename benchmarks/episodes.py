@@ -108,13 +108,13 @@ def of_control() -> list[dict[str, object]]:
     for how, n_bins, beta in (("12 x 12 bins, beta 2, exact", 12, 2.0), ("30 x 30 bins, beta 100, exact", 30, 100.0)):
         model = erl_torch.estimate_mdp("mountain_car", bins=n_bins, seed=0).mdp
         policy = erl_torch.solve_soft_bellman(model, beta).policy.numpy()
-        played = erl_torch.rollout("mountain_car", policy, 1000, 200, np.random.default_rng(0), bins=n_bins)
+        driven = erl_torch.rollout("mountain_car", policy, 1000, 200, np.random.default_rng(0), bins=n_bins)
         rows.append(
             {
                 "environment": "MountainCar-v0",
                 "policy": how,
-                "success_limited": float((played.lengths < 200).mean()),
-                "return_limited": float(played.returns.mean()),
+                "success_limited": float((driven.lengths < 200).mean()),
+                "return_limited": float(driven.returns.mean()),
                 "limit": 200,
             }
         )

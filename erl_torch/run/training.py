@@ -95,11 +95,14 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
         if cfg[key] and not many:
             raise InputError(key, cfg[key], "left out, or used with n_replicas > 1 or vary.KEY=[...]")
     with collected() as notes, contextlib.closing(make_env(cfg.env)) as env:
+        beta = prior = None
+        if cfg.env.get("end_reward") == "auto" and "beta" not in cfg.vary:  # the charge depends on both
+            learner = make_learner(cfg.learner, *sizes(env))
+            beta, prior = learner.beta, learner.prior_policy
+            if prior is not None:
+                prior = check_policy("learner.prior_policy", prior, *sizes(env))
+        world = make_world(cfg.env, env, safe_point, beta, prior)
         learner = make_learner(cfg.learner, *sizes(env))
-        prior = learner.prior_policy
-        if prior is not None:
-            prior = check_policy("learner.prior_policy", prior, *sizes(env))
-        world = make_world(cfg.env, env, safe_point, None if "beta" in cfg.vary else learner.beta, prior)
         if world.allowed is not None:
             learner = with_prior(learner, world.allowed)
         problem = make_problem(cfg, env, world, learner)
