@@ -31,14 +31,14 @@ def value_iteration(env: gym.Env, discount: float) -> np.ndarray:
     value = np.zeros(n)
 
     def worth(s: int, a: int) -> float:
-        return sum(p * (r + discount * value[to] * (not over)) for p, to, r, over in table[s][a])
+        return float(sum(p * (r + discount * value[to] * (not over)) for p, to, r, over in table[s][a]))
 
     for _ in range(100_000):
         q = np.array([[worth(s, a) for a in range(n_actions)] for s in range(n)])
         if np.abs(q.max(1) - value).max() < 1e-12:
             break
         value = q.max(1)
-    return np.eye(n_actions)[q.argmax(1)]
+    return np.asarray(np.eye(n_actions)[q.argmax(1)])
 
 
 def of_tables() -> list[dict[str, object]]:

@@ -16,6 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
 
@@ -95,12 +96,13 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
         if cfg[key] and not many:
             raise InputError(key, cfg[key], "left out, or used with n_replicas > 1 or vary.KEY=[...]")
     with collected() as notes, contextlib.closing(make_env(cfg.env)) as env:
-        beta = prior = None
+        beta: float | None = None
+        prior: np.ndarray | None = None
         if cfg.env.get("end_reward") == "auto" and "beta" not in cfg.vary:  # the charge depends on both
             learner = make_learner(cfg.learner, *sizes(env))
-            beta, prior = learner.beta, learner.prior_policy
-            if prior is not None:
-                prior = check_policy("learner.prior_policy", prior, *sizes(env))
+            beta = learner.beta
+            if learner.prior_policy is not None:
+                prior = check_policy("learner.prior_policy", learner.prior_policy, *sizes(env))
         world = make_world(cfg.env, env, safe_point, beta, prior)
         learner = make_learner(cfg.learner, *sizes(env))
         if world.allowed is not None:
