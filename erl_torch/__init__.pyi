@@ -36,6 +36,7 @@ from erl_torch.learners.s1.algorithm import AlgorithmS1 as AlgorithmS1
 from erl_torch.learners.s1.algorithm import ListedS1 as ListedS1
 from erl_torch.learners.s1.algorithm import S1State as S1State
 from erl_torch.mdp.from_gymnasium import MeanRewardWarning as MeanRewardWarning
+from erl_torch.mdp.from_gymnasium import model_ends as model_ends
 from erl_torch.mdp.from_gymnasium import tabular_mdp as tabular_mdp
 from erl_torch.mdp.masks import ActionMasks as ActionMasks
 from erl_torch.mdp.tabular import TabularMDP as TabularMDP
@@ -50,6 +51,8 @@ from erl_torch.solvers import iterate_biasing as iterate_biasing
 from erl_torch.solvers import perron as perron
 from erl_torch.solvers import solve_biasing as solve_biasing
 from erl_torch.solvers import solve_soft_bellman as solve_soft_bellman
+from erl_torch.solvers.charge import Charge as Charge
+from erl_torch.solvers.charge import smallest_charge as smallest_charge
 from erl_torch.solvers.discounted import solve_discounted as solve_discounted
 from erl_torch.solvers.episodes import EpisodeFigures as EpisodeFigures
 from erl_torch.solvers.episodes import evaluate_episodes as evaluate_episodes

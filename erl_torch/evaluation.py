@@ -189,6 +189,7 @@ def _evaluate_by_playing(
                 failed, more = ends.of(step.r, step.s_next)
                 charged += more
                 n_successes += not failed
+        n_successes += ends is not None and ends.failures.every and not step.terminated
     succeeded = np.nan if ends is None else n_successes / n_episodes
     paid = total + charged
     return Evaluation(total / n_episodes, paid / n_steps, float(paid - total_kl / beta) / n_steps, succeeded)

@@ -13,6 +13,7 @@ from erl_torch.lazy import loader
 
 if TYPE_CHECKING:
     from erl_torch.envs.discretise import Discretise, UniformBins
+    from erl_torch.envs.ends import EndReward
     from erl_torch.envs.frozen_lake import windy_frozen_lake
     from erl_torch.envs.grid_world import GridWorld
     from erl_torch.envs.mazes import random_maze, random_mazes
@@ -55,6 +56,7 @@ for _id, _entry_point in ENTRY_POINTS.items():
 
 _HOME = {
     "Discretise": "discretise",
+    "EndReward": "ends",
     "GridWorld": "grid_world",
     "GridWorldEnv": "tabular",
     "TabularEnv": "tabular",
@@ -67,6 +69,7 @@ _HOME = {
 
 __all__ = [
     "Discretise",
+    "EndReward",
     "GridWorld",
     "GridWorldEnv",
     "TabularEnv",

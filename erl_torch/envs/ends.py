@@ -36,7 +36,7 @@ class EndReward(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs
         self.rule = EndRule(rule, checks.finite("end_reward", end_reward))
         if end_reward < 0 and rule.limit == -float("inf") and not rule.states:
             raise InputError("end_reward", end_reward, "0, or a bonus > 0: no end is a failure by this rule")
-        if end_reward > 0 and rule.limit == float("inf"):
+        if end_reward > 0 and rule.every:
             raise InputError("end_reward", end_reward, "0, or a charge < 0: every end is a failure by this rule")
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:

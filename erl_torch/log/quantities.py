@@ -250,7 +250,8 @@ QUANTITIES = (
         "success_rate",
         "1",
         "share of episodes that end, within `evaluation.horizon` steps and the environment's own limit, in an end that "
-        "is no failure (`env.failures`): exact where `return` is, else of the episodes played",
+        "is no failure (`env.failures`); where every end is one, that do not end: exact where `return` is, else of the "
+        "episodes played",
         _FIGURE,
         board=RETURNS,
         chart="success rate; optimal, prior",

@@ -63,6 +63,11 @@ class Failures:
             return cls(min(best, UNPAID))
         return cls({"unpaid": UNPAID, "all": np.inf, "none": -np.inf}[rule])
 
+    @property
+    def every(self) -> bool:
+        """Whether every end is a failure, so that an episode succeeds by not ending."""
+        return self.states is None and self.limit == np.inf
+
     def among(self, reward: ArrayLike, state: ArrayLike) -> np.ndarray:
         """[N] bool: which of N ends are failures, by the ``reward`` of the ending step and the ``state`` it led to."""
         if self.states is not None:

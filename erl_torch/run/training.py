@@ -16,6 +16,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
+import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
 
@@ -107,14 +109,7 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
             print(f"{log.report}\n")
         else:
             env = stack.enter_context(contextlib.closing(make_env(cfg.env)))
-            learner = make_learner(cfg.learner, *sizes(env))
-            prior = learner.prior_policy
-            if prior is not None:
-                prior = check_policy("learner.prior_policy", prior, *sizes(env))
-            world = make_world(cfg.env, env, safe_point, None if "beta" in cfg.vary else learner.beta, prior)
-            if world.allowed is not None:
-                learner = with_prior(learner, world.allowed)
-            problem = make_problem(cfg, env, world, learner)
+            learner, problem = _of_environment(cfg, env, safe_point)
         learner, problem, experience, recorder, more = (_replicas if many else _single)(
             cfg, learner, problem, log, settings, safe_point
         )
@@ -134,6 +129,24 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
         )
         _, result = run.perform(notes)
         return result
+
+
+def _of_environment(
+    cfg: DictConfig, env: gym.Env[Any, Any], safe_point: SafePoint
+) -> tuple[TabularLearner[Any], Problem]:
+    """Who learns, and what, where there is an environment."""
+    beta: float | None = None
+    prior: np.ndarray | None = None
+    if cfg.env.get("end_reward") == "auto" and "beta" not in cfg.vary:  # the charge depends on both
+        learner = make_learner(cfg.learner, *sizes(env))
+        beta = learner.beta
+        if learner.prior_policy is not None:
+            prior = check_policy("learner.prior_policy", learner.prior_policy, *sizes(env))
+    world = make_world(cfg.env, env, safe_point, beta, prior)
+    learner = make_learner(cfg.learner, *sizes(env))
+    if world.allowed is not None:
+        learner = with_prior(learner, world.allowed)
+    return learner, make_problem(cfg, env, world, learner)
 
 
 def evaluation_settings(cfg: DictConfig) -> EvaluationSettings:
