@@ -1944,6 +1944,56 @@ MUTANTS = [
         "log_u = self.log_average - self.log_psi_in_use[:, None]",
         "test_efficient_s1.py::test_u_is_of_the_pairs_that_take_part",
     ),
+    # -- spaces, names, what environments return ---------------------------------------------------------------
+    Mutant(
+        "the parts of a Dict count in the order of their definition",
+        "labels.py",
+        "names = sorted(space.spaces)",
+        "names = list(space.spaces)",
+        "test_labels.py::test_the_last_entry_counts_fastest",
+    ),
+    Mutant(
+        "half a state is a state",
+        "labels.py",
+        "good = np.isfinite(entries) & (entries == np.floor(entries)) & (abs(entries) < 2**63)",
+        "good = np.isfinite(entries) & (abs(entries) < 2**63)",
+        "test_labels.py::test_whole_numbers_are_taken_from_floats_and_nothing_else_is",
+    ),
+    Mutant(
+        "a model is believed whatever overrides step",
+        "mdp/from_gymnasium.py",
+        "if len(owners) > 1 and not",
+        "if len(owners) > 9 and not",
+        "test_spaces.py::test_a_model_of_another_step_is_not_believed",
+    ),
+    Mutant(
+        "a method replaced on the object is not seen",
+        "mdp/from_gymnasium.py",
+        'if method in getattr(base, "__dict__", {}):',
+        "if False:",
+        "test_spaces.py::test_a_replaced_method_is_seen",
+    ),
+    Mutant(
+        "an entry of three never ends an episode",
+        "mdp/from_gymnasium.py",
+        "end[loose] = into_nothing[loose]",
+        "end[loose] = False",
+        "test_spaces.py::test_tables_are_read_as_they_are_meant",
+    ),
+    Mutant(
+        "rewards that are NaN enter the stream",
+        "experience/play.py",
+        "    if not np.isfinite(r):\n        raise",
+        "    if False:\n        raise",
+        "test_spaces.py::test_a_wrong_step_is_named",
+    ),
+    Mutant(
+        "the last state of a vector's episode keeps its own name",
+        "envs/encoded.py",
+        '[None if last is None else self._last(last) for last in info["final_obs"]]',
+        '[None if last is None else 0 for last in info["final_obs"]]',
+        "test_spaces.py::test_other_names_give_the_same_stream_of_vectors",
+    ),
 ]
 
 

@@ -145,7 +145,7 @@ def test_the_first_wrong_row_of_a_column_is_named(column):
 def test_whole_numbers_are_taken_from_floats_and_nothing_else_is():
     labels = Labels.of_space(spaces.Discrete(3, start=1))
     assert [labels.encode(x) for x in (1, 2.0, np.float32(3), np.array(2), "3")] == [0, 1, 2, 1, 2]
-    for wrong in (0, 4, 0.5, np.nan, np.inf, 2**70, None, "up", [1], np.array([1]), 1j, 1e300):
+    for wrong in (0, 4, 0.5, 1.5, np.nan, np.inf, 2**70, None, "up", [1], np.array([1]), 1j, 1e300):
         with pytest.raises(InputError, match=r"in Discrete\(3, start=1\)"):
             labels.encode(wrong)
 
