@@ -578,6 +578,9 @@ def test_a_run_says_what_the_data_say_and_no_more(tmp_path, shop, capsys, learne
         assert result["objective"] == pytest.approx(-theta, abs=1e-5)
     else:
         assert result["objective"] <= -theta + 1e-9  # of the model of the counts, its best is -theta
+    with np.load(tmp_path / "run" / "solution.npz") as saved:
+        assert saved["state_labels"].tolist() == ["gold", "new", "regular", "sleeping"]
+        assert saved["action_labels"].tolist() == ["call", "mail", "nothing"]
     table = list(csv.reader((tmp_path / "run" / "policy.csv").read_text().splitlines()))
     assert table[0] == ["state", "action", "probability", "prior", "visits"]
     assert {(s, a) for s, a, *_ in table[1:]} == set(policy)
