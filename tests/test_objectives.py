@@ -480,3 +480,36 @@ def test_episodes_that_never_end():
     cliff = tabular_mdp(gym.make("CliffWalking-v1"), "absorb")
     assert (figures := evaluate_episodes(cliff, np.eye(4)[np.zeros(48, int)])).steps.low == np.inf
     assert (figures.mean_return.low, figures.mean_return.high) == (-np.inf, np.inf)
+
+
+# -- missing actions --------------------------------------------------------------------------------------------------
+
+
+def test_a_missing_action_is_as_if_another_had_its_prior():
+    """An action that does not exist, against one that is the copy of an existing one, whose prior the two share."""
+    rng = np.random.default_rng(9)
+    for _ in range(20):
+        p, r = rng.dirichlet(np.ones(4), (4, 3)), -rng.random((4, 3))
+        p[3], r[3] = np.eye(4)[3], 0.0
+        start = [0.5, 0.3, 0.2, 0.0]
+        missing = rng.random((4, 3)) < 0.4
+        missing[np.arange(4), rng.integers(0, 3, 4)] = False
+        copied, paid, prior = p.copy(), r.copy(), np.zeros((4, 3))
+        for s in range(4):
+            there, gone = np.flatnonzero(~missing[s]), np.flatnonzero(missing[s])
+            prior[s, there] = 1 / len(there)
+            copied[s, gone], paid[s, gone] = p[s, there[0]], r[s, there[0]]
+            prior[s, [there[0], *gone]] /= 1 + len(gone)
+            prior[s, gone] = prior[s, there[0]]
+        mdp, twin = TabularMDP(p, np.where(missing, -np.inf, r), start), TabularMDP(copied, paid, start)
+        for solve in (
+            lambda m, prior: solve_discounted(m, 3.0, 0.9, prior),
+            lambda m, prior: solve_finite_horizon(m, 3.0, 7, prior),
+            lambda m, prior: solve_first_exit(m, 3.0, prior),
+        ):
+            found, other = solve(mdp, None), solve(twin, prior)
+            assert found.status is Status.CONVERGED
+            assert np.allclose(found.value, other.value, rtol=0, atol=1e-11)
+            assert not found.policy.numpy()[..., missing].any()
+            assert np.isneginf(found.action_value.numpy()[..., :3, :][..., missing[:3]]).all()
+            assert found.gap < 1e-10
