@@ -10,6 +10,7 @@ import tempfile
 from pathlib import Path
 from types import SimpleNamespace
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
@@ -93,6 +94,7 @@ def mine(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     for name in ("mine", "broken"):
         monkeypatch.delitem(sys.modules, name, raising=False)  # of another test
+    monkeypatch.delitem(gym.registry, "Mine-v0", raising=False)
 
 
 @pytest.mark.slow
