@@ -18,6 +18,7 @@ import itertools
 import sys
 import warnings
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -52,14 +53,14 @@ def models() -> Iterator[Model]:
     forests = {"": (-2.5512235472, -3.1706852819), "S=10": (-0.8931563759, -1.4803672398)}
     forests["S=300, is_sparse=True"] = (-0.2556253734, -0.4050739131)
     for arguments, values in forests.items():
-        yield Model("pymdptoolbox", f"forest({arguments})", lambda a=arguments: _toolbox(f"forest({a})"), *values)
+        yield Model("pymdptoolbox", f"forest({arguments})", partial(_toolbox, f"forest({arguments})"), *values)
     yield Model("pymdptoolbox", "small()", lambda: _toolbox("small()"), -3.3959110890, -3.8195743278)
     yield Model("pymdptoolbox", "rand(12, 3), seed 0", _random_toolbox, -0.1027057639, -0.3051268215)
     yield Model("quantecon", "random_discrete_dp(20, 4), seed 0", _random_quantecon, -0.2933224748, -0.8416074609)
     yield Model("quantecon", "DiscreteDP of Puterman 3.1", _puterman_1, 1.0, 1.0)
     yield Model("quantecon", "DiscreteDP of Puterman 3.2.1", _puterman_2, -1.4981619060, -2.1083586110)
     for name, theta in GYM_CLASSICS.items():
-        yield Model("gym-classics", name, lambda n=name: _gym_classics(n), theta)
+        yield Model("gym-classics", name, partial(_gym_classics, name), theta)
     yield Model("minigrid", "Empty-5x5", _minigrid, -0.0085355096, -0.0559190434)
     yield Model("gymnasium", "FrozenLake-v1", lambda: _table("FrozenLake-v1"), -0.0019155856, -0.0028229629)
     yield Model("gymnasium", "CliffWalking-v1", lambda: _table("CliffWalking-v1"), 1.0471663132, 1.0047166313)
@@ -68,13 +69,13 @@ def models() -> Iterator[Model]:
 
 
 def _toolbox(call: str) -> TabularMDP:
-    import mdptoolbox.example
+    import mdptoolbox.example  # type: ignore[import-not-found]
 
     return TabularMDP.from_pymdptoolbox(*eval(f"example.{call}", {"example": mdptoolbox.example}))
 
 
 def _random_toolbox() -> TabularMDP:
-    import mdptoolbox.example
+    import mdptoolbox.example  # type: ignore[import-not-found]
 
     np.random.seed(0)  # noqa: NPY002 (mdptoolbox draws from it)
     return TabularMDP.from_pymdptoolbox(*mdptoolbox.example.rand(12, 3))
@@ -102,7 +103,7 @@ def _puterman_2() -> TabularMDP:
 
 
 def _gym_classics(name: str) -> TabularMDP:
-    import gym_classics
+    import gym_classics  # type: ignore[import-not-found]
 
     if f"{name}-v0" not in gym.registry:
         gym_classics.register("gymnasium")
@@ -120,7 +121,7 @@ def _gym_classics(name: str) -> TabularMDP:
 
 
 def _minigrid() -> TabularMDP:
-    import minigrid  # noqa: F401
+    import minigrid  # type: ignore[import-not-found]  # noqa: F401
 
     env: Any = gym.make("MiniGrid-Empty-5x5-v0").unwrapped
     env.reset(seed=0)

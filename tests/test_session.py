@@ -515,7 +515,7 @@ def test_wrappers_and_limits_belong_to_a_run(tmp_path):
     learnt(gym.make("FrozenLake-v1", max_episode_steps=10))
     for other in (
         gym.make("FrozenLake-v1", max_episode_steps=20),
-        gym.wrappers.TransformReward(gym.make("FrozenLake-v1", max_episode_steps=10), lambda r: 2 * r),
+        gym.wrappers.TransformReward(gym.make("FrozenLake-v1", max_episode_steps=10), lambda r: 2 * float(r)),
     ):
         with pytest.raises(InputError, match="of a run with these settings"):
             learnt(other)
@@ -591,7 +591,7 @@ class Diverging(AlgorithmS1):
 
     def step(self, state, stream):
         after = super().step(state, stream)
-        return dataclasses.replace(after, u=after.u * torch.nan) if after.n_tuples > 2 * len(stream.data) else after
+        return dataclasses.replace(after, u=after.u * float("nan")) if after.n_tuples > 2 * len(stream.data) else after
 
 
 def test_a_policy_that_is_lost_is_non_finite(tmp_path, tuples):

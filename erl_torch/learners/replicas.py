@@ -213,7 +213,7 @@ class Replicas(Together):
         states: list[StreamState] = []
         before: list[object] = []
         for learner in self.learners:
-            settings = [getattr(learner, field.name) for field in fields(learner)]
+            settings = [getattr(learner, field.name) for field in fields(learner)]  # type: ignore[arg-type]
             # A state is a value: neighbours of the same settings share theirs.
             same = states and all(one is other for one, other in zip(settings, before, strict=True))
             states.append(states[-1] if same else learner.start(problem))

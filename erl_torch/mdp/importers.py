@@ -48,9 +48,9 @@ def of_outcomes(n_states: int, n_actions: int, outcomes: Outcomes) -> Arrays:
     return sp.csr_array((data, columns, ends), shape=(n_states * n_actions, n_states)), reward
 
 
-def _outcome(key: str, entry: object, n_states: int) -> tuple[float, int, float]:
+def _outcome(key: str, entry: Any, n_states: int) -> tuple[float, int, float]:  # whatever the caller's function gives
     try:
-        p, to, r = entry  # type: ignore[misc]  # whatever the caller's function gives
+        p, to, r = entry
     except (TypeError, ValueError) as error:
         raise InputError(key, entry, "entries (probability, s', reward)") from error
     probability = checks.number(f"{key}: probability", p, lambda x: 0 <= x < math.inf, "finite and >= 0")
@@ -62,10 +62,10 @@ def _outcome(key: str, entry: object, n_states: int) -> tuple[float, int, float]
 # -- one matrix an action -----------------------------------------------------------------------------------
 
 
-def is_by_action(value: object) -> bool:
+def is_by_action(value: Any) -> bool:
     """Whether ``value`` is a list (tuple, object array) of matrices of which one is sparse: one an action."""
     listed = isinstance(value, (list, tuple)) or (isinstance(value, np.ndarray) and value.dtype.kind == "O")
-    return listed and any(checks.is_sparse(one) for one in value)  # type: ignore[union-attr]
+    return listed and any(checks.is_sparse(one) for one in value)
 
 
 def by_action(key: str, value: object) -> sp.csr_array:
@@ -221,7 +221,7 @@ def prism_start(labels: str | os.PathLike[str], n_states: int) -> np.ndarray:
             start[_below(labels, n, words[0].rstrip(":"), n_states)] = 1.0
     if not start.any():
         raise InputError(f"path={labels}", "no state", 'with a state of label "init"')
-    return start / start.sum()
+    return np.asarray(start / start.sum())
 
 
 def _read_lines(path: str | os.PathLike[str]) -> list[tuple[int, list[str]]]:

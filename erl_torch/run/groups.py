@@ -93,7 +93,8 @@ def groups_among(learners: Sequence[StreamLearner[Any, Any]]) -> tuple[list[Grou
     for rows in members.values():
         first = learners[rows[0]]
         groups.append(Group({name: getattr(first, name) for name in names}, np.array(rows), float(first.beta)))
-    vary = {name: {told[group.members[0]][name]: group.settings[name] for group in groups} for name in names}
+    firsts = [rows[0] for rows in members.values()]
+    vary = {name: {told[r][name]: getattr(learners[r], name) for r in firsts} for name in names}
     return groups, {name: list(values.values()) for name, values in vary.items()}
 
 

@@ -21,7 +21,16 @@ from erl_torch.checks import LARGEST_INTEGER, InputError
 from erl_torch.mdp.tabular import TabularMDP
 
 DEEPEST = 20  # objects in objects
-TOLD_BY_REPR = (complex, fractions.Fraction, decimal.Decimal, PurePath, slice, range, type(...), datetime.tzinfo)
+TOLD_BY_REPR: tuple[type, ...] = (
+    complex,
+    fractions.Fraction,
+    decimal.Decimal,
+    PurePath,
+    slice,
+    range,
+    type(...),
+    datetime.tzinfo,
+)
 TOLD_BY_REPR += (datetime.date, datetime.time, datetime.timedelta, np.dtype)
 
 

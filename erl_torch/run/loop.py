@@ -145,7 +145,7 @@ class Run(Generic[S, E, A]):
         if checkpoint:
             if checkpoint["digest"] != self.digest:
                 raise InputError("experience", "another stream", "the one that the run in its directory began with")
-            rows = rows_of(checkpoint["history"])
+            rows: list[Row] = [*rows_of(checkpoint["history"])]
             outcome = Outcome(checkpoint["state"], rows, checkpoint["learning"], recorded=checkpoint["recorded"])
             recorder.restore(checkpoint)
             began -= checkpoint["seconds"]
@@ -195,7 +195,7 @@ class Run(Generic[S, E, A]):
             result["message"] = f"{type(ended.error).__name__}: {ended.error}"
         result["seconds"] = round(time.perf_counter() - began, 3)
         result["notes"] = notes
-        result = _finite(result)
+        result = {key: _finite(value) for key, value in result.items()}
         write_json(saved.directory / "result.json", result)
         if self.talks:
             print(recorder.summary(result, saved.directory))

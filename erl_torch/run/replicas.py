@@ -51,6 +51,7 @@ MOST_LETTERS = 64  # of a setting that is text, in ``replicas.npz``
 WORST_FIRST = (
     Status.NON_FINITE,
     Status.STOPPED,
+    Status.ILL_POSED,
     Status.PSI_LIMIT,
     Status.STEP_LIMIT,
     Status.STAGNATED,

@@ -227,7 +227,7 @@ def _checked(
         raise InputError("checkpoint_every", checkpoint_every, "seconds >= 0, or None")
     checks.instance("evaluation", settings, EvaluationSettings, "EvaluationSettings, or None")
     many = isinstance(learner, Replicas)
-    one = learner.learners[0] if many else learner
+    one: Any = learner.learners[0] if many else learner
     if not is_dataclass(one) or isinstance(one, type):
         raise InputError("learner", learner, "a learner, as AlgorithmS1(): a dataclass derived from StreamLearner")
     absent = [name for name in CONTRACT if not hasattr(one, name)]
@@ -247,7 +247,8 @@ def _checked(
         checks.instance("experience", experience, Transitions, "Transitions: replicas hold their tuples in memory")
     elif experience is not None:
         checks.instance("experience", experience, Experience, EXPERIENCE)
-    return one
+    found: TabularLearner[Any] = learner.learners[0] if many else learner
+    return found
 
 
 def _problem(given: Known, prior_policy: Table, horizon: int) -> Problem:
