@@ -248,7 +248,7 @@ def test_unknown_keys_get_one_line(tmp_path, group, plus):
         (["learner.beta="], "learner.beta="),
         (["learner.beta=[1,"], "learner.beta=[1,: not of the form key=value"),
         (["env=gym", "env.id=Nowhere-v0"], "env.id=Nowhere-v0: must be an environment that Gymnasium has"),
-        (["env=gym", "env.id=CartPole-v1"], "observation_space=Box"),
+        (["env=gym", "env.id=CartPole-v1"], "env.observation_space=Box"),
         (["env=gym", "env.id=FrozenLake-v1", "++env.kwargs.ice=3"], "env.kwargs={'ice': 3}: must be arguments of"),
         (["learner.beta=1000"], "learner.beta=1000.0: must be below 745"),
         (["n_replicas=2.5"], "n_replicas=2.5: must be a whole number >= 1, in digits"),
