@@ -75,7 +75,7 @@ def _toolbox(call: str) -> TabularMDP:
 
 
 def _random_toolbox() -> TabularMDP:
-    import mdptoolbox.example  # type: ignore[import-not-found]
+    import mdptoolbox.example
 
     np.random.seed(0)  # noqa: NPY002 (mdptoolbox draws from it)
     return TabularMDP.from_pymdptoolbox(*mdptoolbox.example.rand(12, 3))

@@ -43,7 +43,9 @@ from erl_torch.learners import CertaintyEquivalence, Exact
 from erl_torch.learners.learner import columns
 from erl_torch.learners.s1.algorithm import S1State
 from erl_torch.log.event_file import EventFile
+from erl_torch.log.tensorboard import hyperparameters
 from erl_torch.run.checkpoint import check_state, decode, encode
+from erl_torch.run.groups import Group, Record
 from erl_torch.run.identity import plain
 from erl_torch.run.replicas import _status
 from erl_torch.run.training import train as train_configured
@@ -865,3 +867,38 @@ def test_the_scale_of_u_is_free_with_the_prior_for_unvisited_pairs(rescale_every
     )
     assert found.theta == pytest.approx(once.theta, rel=1e-9)
     np.testing.assert_allclose(found.policy, once.policy, rtol=1e-9)
+
+
+def test_replicas_that_are_lost_do_not_count():
+    board = types.SimpleNamespace(scalars=lambda values, step: None)
+    group = Group({}, slice(0, 3), 1.0)
+    record = Record([group], [{}])
+    record.add(0, {"theta": np.arange(3.0), "objective": np.arange(3.0)}, board)
+    alive = np.array([True, False, True])
+    record.add(9, {"theta": np.array([1.0, 99.0, 3.0]), "objective": np.array([np.nan, 5.0, 7.0])}, board, alive)
+    found = record.statistics(group)
+    assert (found["theta"]["mean"], found["theta"]["max"]) == (2.0, 3.0)
+    assert (found["objective"]["mean"], found["objective"]["min"]) == (7.0, 7.0)
+    assert found["replicas"] == 2  # of the quantity that most of them have
+
+
+def test_a_metric_that_is_no_number_is_not_drawn(tmp_path, tuples):
+    @dataclass(frozen=True, eq=False)
+    class Kept(S1State):
+        def metrics(self):
+            return {**super().metrics(), "x": np.nan if self.n_tuples > len(tuples) else 1.0}
+
+    class Own(AlgorithmS1):
+        states = (Kept,)
+
+        def init(self, n_states, n_actions):
+            state = super().init(n_states, n_actions)
+            return Kept(**{f.name: getattr(state, f.name) for f in dataclasses.fields(state)})
+
+    erl_torch.train(Own(n_epochs=3, n_bias=1), MDP, tuples, directory=tmp_path, evaluation=QUICK)
+    assert scalars(tmp_path)["learner/x"] == [(0, 1.0), (len(tuples), 1.0)]
+
+
+def test_what_is_not_set_is_no_hyperparameter():
+    settings = {"env": {"name": "lake", "kwargs": {}, "bins": None, "size": 3}, "learner": {"name": "s1"}, "seed": 0}
+    assert hyperparameters(settings) == {"env": "lake", "learner": "s1", "env.size": 3, "seed": 0}
