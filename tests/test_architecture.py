@@ -74,6 +74,16 @@ def test_imports_run_down(name):
             assert down, f"{name} imports {other}"
 
 
+def test_imports_say_where_from():
+    """The tests here would not see others: ``from . import x``, or names of the whole package."""
+    for name, path in modules():
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom):
+                assert not node.level, f"{name}: a relative import"
+            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "erl_torch":
+                assert node.attr == "__version__", f"{name}: {node.attr} of the whole package"
+
+
 def test_there_is_no_circle():
     graph = {name: {o for o in imported(path) if o != name and o} for name, path in modules() if name}
     done, now = set(), []
