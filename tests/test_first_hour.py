@@ -95,6 +95,9 @@ def mine(tmp_path, monkeypatch):
     for name in ("mine", "broken"):
         monkeypatch.delitem(sys.modules, name, raising=False)  # of another test
     monkeypatch.delitem(gym.registry, "Mine-v0", raising=False)
+    yield
+    for name in ("mine", "broken"):
+        sys.modules.pop(name, None)
 
 
 @pytest.mark.slow
