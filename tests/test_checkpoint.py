@@ -45,7 +45,7 @@ def after(calls, error):
 
 
 def names(directory):
-    return sorted(p.name if "tfevents" not in p.name else "events" for p in directory.iterdir())
+    return sorted(p.name if "tfevents" not in p.name else "events" for p in directory.iterdir() if p.is_file())
 
 
 def ended(cfg, directory, epochs, error=Killed):

@@ -95,6 +95,10 @@ def mine(tmp_path, monkeypatch):
     for name in ("mine", "broken"):
         monkeypatch.delitem(sys.modules, name, raising=False)  # of another test
     monkeypatch.delitem(gym.registry, "Mine-v0", raising=False)
+    yield
+    gym.registry.pop("Mine-v0", None)
+    for name in ("mine", "broken"):
+        sys.modules.pop(name, None)
 
 
 @pytest.mark.slow

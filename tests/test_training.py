@@ -31,7 +31,7 @@ def finished(tmp_path_factory):
 
 def test_run_directory(finished):
     directory, result = finished
-    names = sorted(p.name for p in directory.iterdir())
+    names = sorted(p.name for p in directory.iterdir() if p.is_file())
     assert names[0].startswith("events.out.tfevents")
     assert names[1:] == ["result.json", "settings.json", "solution.npz"]
     assert json.loads((directory / "result.json").read_text()) == result
@@ -369,7 +369,9 @@ def test_resume_takes_only_what_a_run_begins_with(typed_here, tmp_path, monkeypa
     assert err.count("\n") == 1
     assert path.read_bytes() == content
     if "module" in expected and b"- env=" in content:
-        assert typed_here("train.py", "resume=run", "env=mine:Id-v0")[0] == "imported"
+        code, _, err = typed_here("train.py", "resume=run", "env=mine:Id-v0")
+        assert code == 1
+        assert "mine failed (SystemExit: imported, mine.py, line 1)" in err
 
 
 def test_help_is_complete_and_needs_no_torch(tmp_path, start):

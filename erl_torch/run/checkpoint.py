@@ -32,6 +32,7 @@ from erl_torch.evaluation import Evaluation
 from erl_torch.files import read_json, write_bytes, write_json
 from erl_torch.learners.learner import NonFiniteError
 from erl_torch.log.event_file import PATTERN
+from erl_torch.log.tensorboard import BESIDE
 from erl_torch.solution import Solution, Status
 
 FORMAT = 4  # 1 knew no settings, 2 no types of NumPy's numbers, 3 not which epoch was recorded last
@@ -139,6 +140,11 @@ class Checkpoints:
                 ours = {self.directory / "settings.json"} if not self._ours else set()
                 for path in (ours | {*self.directory.glob(PATTERN)}) - self._others:
                     path.unlink(missing_ok=True)
+                for folder in (self.directory / name for name in BESIDE.values()):
+                    for path in folder.glob(PATTERN):
+                        path.unlink(missing_ok=True)
+                    with contextlib.suppress(OSError):  # not there, or somebody else's too
+                        folder.rmdir()
                 self.clear()
             raise
 
