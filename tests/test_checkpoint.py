@@ -313,11 +313,15 @@ def test_an_error_after_the_learning_keeps_it(tmp_path, monkeypatch):
     def failing(*_):
         raise MemoryError
 
-    monkeypatch.setattr("erl_torch.run.single.certify", failing)
-    with pytest.raises(MemoryError):
-        train(composed(*SMALL, *SHORT["s1"]), tmp_path)
-    assert json.loads((tmp_path / "result.json").read_text())["status"] == "completed"
-    assert Solution.load(tmp_path / "solution.npz").status is Status.COMPLETED
+    cfg = composed(*SMALL, *SHORT["s1"])
+    with monkeypatch.context() as patch:
+        patch.setattr("erl_torch.run.single.certify", failing)
+        with pytest.raises(MemoryError):
+            train(cfg, tmp_path)
+    result = json.loads((tmp_path / "result.json").read_text())
+    assert (result["status"], result["message"]) == ("stopped", "MemoryError: ")
+    assert Solution.load(tmp_path / "solution.npz").status is Status.COMPLETED  # the learning is
+    assert train(cfg, tmp_path)["gap"] is not None
 
 
 def test_a_certificate_beyond_memory_is_named(tmp_path, monkeypatch):
