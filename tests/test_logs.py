@@ -748,3 +748,63 @@ def truth():
             to[s] += stays * (1 - up) / 2
             pairs[s, a] = (dict(to), SHOP["SALES"][s] - SHOP["COSTS"][a])
     return pairs
+
+
+# -- a charge or a bonus at the ends of a log -------------------------------------------------------------------
+
+ENDS = """state,action,reward,terminated
+a,go,0,0
+b,go,-1,1
+a,go,0,0
+b,go,2,1
+a,stay,0.5,0
+a,go,0,0
+b,stay,0,1
+"""
+
+
+@pytest.mark.parametrize(
+    ("end_reward", "failures", "expected"),
+    [
+        (-3, "default", [0, -4, 0, 2, 0.5, 0, -3]),  # ends that pay at most 0, as one pays 2
+        (-3, "all", [0, -4, 0, -1, 0.5, 0, -3]),
+        (5, "default", [0, -1, 0, 7, 0.5, 0, 0]),
+        (5, "none", [0, 4, 0, 7, 0.5, 0, 5]),
+        (0, "default", [0, -1, 0, 2, 0.5, 0, 0]),
+    ],
+)
+def test_ends_of_a_log_count(tmp_path, end_reward, failures, expected):
+    path = tmp_path / "log.csv"
+    path.write_text(ENDS)
+    log = read_log(path, end_reward=end_reward, failures=failures)
+    assert log.experience.r.tolist() == expected
+    assert log.report.reward_range == (-1, 2)  # as recorded
+    cfg = composed(
+        "experience=recorded", f"experience.path={path}", f"env.end_reward={end_reward}", f"env.failures={failures}",
+        "learner=certainty_equivalence", "evaluation.pictures=false",
+    )  # fmt: skip
+    assert train(cfg, tmp_path / "run")["n_experience"] == 7
+
+
+@pytest.mark.parametrize(
+    ("text", "arguments", "said"),
+    [
+        (ENDS, {"end_reward": -1, "failures": "none"}, "end_reward=-1.0: must be 0: no end is a failure"),
+        (ENDS, {"end_reward": 1, "failures": "all"}, "end_reward=1.0: must be 0: no end is a success"),
+        (ENDS, {"failures": "some"}, "failures=some: must be default or unpaid or all or none"),
+        (ENDS, {"end_reward": float("nan")}, "end_reward=nan"),
+        (ENDS.replace(",1\n", ",0\n"), {"end_reward": -1}, "no row terminates an episode"),
+    ],
+)
+def test_ends_that_nothing_counts_for(tmp_path, text, arguments, said):
+    (tmp_path / "log.csv").write_text(text)
+    with pytest.raises(InputError) as caught:
+        read_log(tmp_path / "log.csv", **arguments)
+    assert said in str(caught.value)
+
+
+def test_auto_needs_a_model(tmp_path):
+    (tmp_path / "log.csv").write_text(ENDS)
+    cfg = composed("experience=recorded", f"experience.path={tmp_path}/log.csv", "env.end_reward=auto")
+    with pytest.raises(InputError, match=r"env.end_reward=auto: must be a number for a log"):
+        train(cfg, tmp_path / "run")

@@ -31,6 +31,7 @@ from erl_torch.experience.formats.table import Cells, InOrder, Table, is_frame, 
 from erl_torch.experience.recording import CHUNK, READ, FileRecording, Recordable
 from erl_torch.experience.transitions import COLUMNS, Transitions
 from erl_torch.labels import Labels
+from erl_torch.mdp.ends import RULES, EndRule, Failures
 from erl_torch.mdp.tabular import check_policy
 from erl_torch.problem import Problem
 
@@ -160,6 +161,8 @@ def read_log(
     chunk: int = CHUNK,
     on_prior: bool = False,
     seed: int = 0,
+    end_reward: float = 0.0,
+    failures: str = "default",
     report: Callable[[int], object] | None = None,
 ) -> Log:
     """Read a log that is all there is to learn from.
@@ -175,6 +178,9 @@ def read_log(
         chunk: tuples in memory at most.
         on_prior: the log was made with the prior policy, so that a' is the action of the next row.
         seed: of a' where it is drawn.
+        end_reward: added to the reward of the steps that terminate an episode: a charge, < 0, of those that fail, or a
+            bonus, > 0, of the others. The report is of the rewards as they are recorded.
+        failures: which ends are failures: "default", "unpaid", "all" or "none" (``erl_torch.mdp.ends``).
         report: called with the number of rows now and then; may raise.
 
     Raises:
@@ -182,6 +188,8 @@ def read_log(
     """
     checks.one_of("unseen_actions", unseen_actions, UNSEEN)
     checks.one_of("on_bad", on_bad, ("stop", "skip"))
+    checks.one_of("failures", failures, RULES)  # the state that an end leads to is none of a log's
+    end_reward = checks.finite("end_reward", end_reward)
     told: Callable[[int], object] = report or (lambda _: None)
     strict = on_bad == "stop"
     source = table_of(path)
@@ -201,7 +209,8 @@ def read_log(
     prior = prior_of(counts.visits, unseen_actions)
     if prior_policy is not None:
         prior = check_policy("prior_policy", prior_policy, *sizes)
-    known = Rows(source, roles, states, actions, prior, on_prior, seed, stride)
+    ends = _end_rule(end_reward, failures, reader.seen)
+    known = Rows(source, roles, states, actions, prior, on_prior, seed, stride, ends)
     recording = FileRecording(
         source.path, *sizes, on_bad=on_bad, chunk=chunk, report=told, format=_Prepared(known), seed=seed
     )
@@ -215,6 +224,19 @@ def read_log(
     )
     told_of = _report(source, roles, states, actions, counts, reader.seen, unseen_actions, bool(stride))
     return Log(problem, recording, told_of, counts.visits)
+
+
+def _end_rule(end_reward: float, failures: str, seen: Seen) -> EndRule | None:
+    """What the ends count for. Raises InputError where no end gets ``end_reward``."""
+    if not end_reward:
+        return None
+    rule = Failures.of(failures, seen.best_end, 1)
+    some = seen.worst_end < rule.limit if end_reward < 0 else seen.best_end >= rule.limit
+    if not seen.terminated or not some:
+        kind = "failure" if end_reward < 0 else "success"
+        which = "no row terminates an episode" if not seen.terminated else f"no end is a {kind} by failures={failures}"
+        raise InputError("end_reward", end_reward, f"0: {which}")
+    return EndRule(rule, end_reward)
 
 
 def prior_of(visits: np.ndarray, unseen_actions: str) -> np.ndarray:

@@ -147,12 +147,22 @@ class Recorded(Source):
             action_labels=problem.action_labels,
         )
 
-    def log(self, seed: int, unseen_actions: str, prior_policy: ArrayLike | None, report: Report) -> Log:
+    def log(
+        self,
+        seed: int,
+        unseen_actions: str,
+        prior_policy: ArrayLike | None,
+        report: Report,
+        end_reward: float = 0.0,
+        failures: str = "default",
+    ) -> Log:
         """All that there is, without an environment: as ``read_log``."""
         return read_log(
             self.path,
             columns=self.columns,
             unseen_actions=unseen_actions,
+            end_reward=end_reward,
+            failures=failures,
             prior_policy=prior_policy,
             on_bad=self.on_bad,
             chunk=self.chunk,

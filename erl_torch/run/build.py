@@ -30,7 +30,7 @@ from erl_torch.experience.sources import Recorded, Source
 from erl_torch.experience.transitions import Transitions, join
 from erl_torch.files import read_npy
 from erl_torch.learners.learner import CONTRACT, TabularLearner, with_prior
-from erl_torch.mdp.ends import EndRule, Failures
+from erl_torch.mdp.ends import RULES, EndRule, Failures
 from erl_torch.mdp.from_gymnasium import (
     MeanRewardWarning,
     absorbing,
@@ -55,7 +55,7 @@ REPLICA_BYTES = 10_000  # of a replica, besides: generators and settings
 LABELS = ("class", "name")  # keys of every group that are no arguments
 OF_THE_MODEL = ("stream", "n_samples", "model_seed")  # of a control task
 NO_ENV = "none"  # in the place of Gymnasium's id
-OF_A_LOG = (*LABELS, "id", "suggest", "unseen_actions")
+OF_A_LOG = (*LABELS, "id", "suggest", "unseen_actions", "end_reward", "failures")
 OF_NO_ENV = (*KEYS_OF_ENV, *OF_THE_MODEL, *OF_EVERY_ENV)
 
 
@@ -320,13 +320,23 @@ def make_log(cfg: DictConfig, safe_point: SafePoint) -> tuple[Log, TabularLearne
         raise InputError("experience", cfg.experience.name, allowed)
     for key in map(str, cfg.env):
         if key not in OF_A_LOG:
-            raise InputError(f"env.{key}", cfg.env[key], "left out: no such key; there is unseen_actions")
+            raise InputError(f"env.{key}", cfg.env[key], f"left out: no such key; there are {', '.join(OF_A_LOG[-3:])}")
     checks.one_of("env.unseen_actions", cfg.env.unseen_actions, UNSEEN)
+    end_reward, failures = cfg.env.get("end_reward", 0.0), cfg.env.get("failures", "default")
+    if end_reward == "auto":
+        allowed = "a number for a log (from Python: erl_torch.smallest_charge, on its counts)"
+        raise InputError("env.end_reward", end_reward, allowed)
+    with group("env"):
+        checks.finite("end_reward", end_reward)
+        checks.one_of("failures", failures, RULES)
     try:
         with group("experience"), _collecting(source.work, None, safe_point) as report:
-            log = source.log(cfg.seed, cfg.env.unseen_actions, learner.prior_policy, report)
+            prior = learner.prior_policy
+            log = source.log(cfg.seed, cfg.env.unseen_actions, prior, report, end_reward, failures)
     except InputError as error:
         name = error.key.removeprefix("experience.")
+        if name == "end_reward":
+            raise InputError("env.end_reward", error.value, error.allowed) from error
         if name.startswith("prior_policy"):
             raise InputError(f"learner.{name}", error.value, error.allowed) from error
         raise

@@ -32,6 +32,7 @@ from erl_torch.experience.formats.format import Batch, Options
 from erl_torch.experience.formats.order import in_order, stride_of
 from erl_torch.experience.formats.roles import NEEDED, Roles, plain, roles_of
 from erl_torch.experience.formats.table import Cells, Table
+from erl_torch.mdp.ends import EndRule
 from erl_torch.mdp.tabular import check_policy
 from erl_torch.rng import streams
 
@@ -73,6 +74,8 @@ class Seen:
     bad: int = 0
     first_bad: str = ""
     sum_of_rewards: float = 0.0  # of the tuples
+    worst_end: float = np.inf  # rewards of the steps that terminate an episode
+    best_end: float = -np.inf
 
 
 class Block(NamedTuple):
@@ -109,6 +112,7 @@ class Rows:
         on_prior: a' is the action of the next row, where that follows.
         seed: of a' where it is drawn.
         stride: of ``step`` from row to row; 0: it tells nothing.
+        ends: what is added to the rewards of the steps that terminate an episode; None: nothing.
 
     ``seen`` is what the last pass met, or the present one has met so far.
     """
@@ -123,7 +127,9 @@ class Rows:
         on_prior: bool = False,
         seed: int = 0,
         stride: float = 0.0,
+        ends: EndRule | None = None,
     ) -> None:
+        self._ends = ends
         self.path, self.short = source.path, 0
         self._source, self._roles, self._stride = source, roles, stride
         self._encodings = {"s": states, "s_next": states, "a": actions, "a_next": actions}
@@ -225,6 +231,13 @@ class Rows:
         seen, good = self.seen, ~now.bad
         seen.episodes += int(ends.sum())
         seen.terminated += int(now.terminated.sum())
+        of_ends = now.r[now.terminated & good]
+        seen.worst_end = min(seen.worst_end, of_ends.min(initial=np.inf))
+        seen.best_end = max(seen.best_end, of_ends.max(initial=-np.inf))
+        if self._ends is not None:
+            failed = now.terminated & self._ends.failures.among(now.r, now.s)
+            counts = failed if self._ends.end_reward < 0 else now.terminated & ~failed
+            now = now._replace(r=now.r + self._ends.end_reward * counts)
         seen.truncated += int((now.truncated & ~now.terminated).sum())
         last = ends & ~now.terminated & (now.s_next < 0)  # truncated, or the episode just ends
         s_next = np.where(now.terminated, then.s, now.s_next)
