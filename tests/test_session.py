@@ -6,7 +6,11 @@ import dataclasses
 import enum
 import functools
 import json
+import os
+import re
 import shutil
+import subprocess
+import sys
 import threading
 import time
 import types
@@ -487,7 +491,33 @@ PAIRS = [
     ([1, [2]], [1, [3]]),
     ({"a": 1}, {"a": 2}),
     (torch.zeros(2), torch.ones(2)),
+    (torch.zeros(2, dtype=torch.bfloat16), torch.zeros(2)),
+    (lambda x, k=1: x + k, lambda x, k=2: x + k),
+    ({0: 0.1}.get, {0: 0.2}.get),
+    (functools.lru_cache(lambda x: x), functools.lru_cache(lambda x: 2 * x)),
+    (collections.OrderedDict(a=1, b=2), collections.OrderedDict(b=2, a=1)),
+    (collections.defaultdict(int), collections.defaultdict(list)),
+    ({1: "a"}, {"1": "a"}),
+    ({1}, {"1"}),
+    (np.ma.masked_array([1, 2], [0, 1]), np.ma.masked_array([1, 2], [0, 0])),
+    (np.sin, np.cos),
+    (re.compile("a"), re.compile("b")),
+    (np.random.default_rng(1), np.random.default_rng(2)),
 ]
+
+
+def test_a_text_is_the_same_in_every_process():
+    """A set's order is not: a run that was killed was refused when it was called again."""
+    program = (
+        "from erl_torch.run.identity import plain; print(plain('f', [lambda x: x in {'alpha', 'beta'}, {'c', 'd'}]))"
+    )
+    texts = {
+        subprocess.run(
+            [sys.executable, "-c", program], env={**os.environ, "PYTHONHASHSEED": seed}, capture_output=True, check=True
+        ).stdout
+        for seed in ("1", "2", "3")
+    }
+    assert len(texts) == 1
 
 
 @pytest.mark.parametrize(("one", "other"), PAIRS, ids=lambda value: type(value).__name__)

@@ -185,7 +185,7 @@ def tabular_mdp(
         if end_reward:
             ends = model_ends(env, failures)
             reward = with_end_reward(reward, ends.ended, ends.failed, end_reward)
-        mask = mdp.allowed if allowed is None else mdp.allowed & np.asarray(allowed, bool)
+        mask = mdp.allowed if allowed is None else mdp.allowed & _mask_of(allowed, mdp.reward.shape)
         first = mdp.start if start is None else start
         mdp = TabularMDP(mdp.transition, reward, first, allowed=mask)  # type: ignore[arg-type]
         last = np.flatnonzero(ending_states(env, mdp.n_states))
@@ -204,7 +204,7 @@ def tabular_mdp(
     deviation = np.sqrt(np.bincount(row, p * (r - mean[row]) ** 2, n_rows))
     mask = ~missing.reshape(n_states, n_actions)
     if allowed is not None:
-        mask &= checks.array("allowed", allowed, (n_states, n_actions)) != 0
+        mask &= _mask_of(allowed, (n_states, n_actions))
         deviation *= mask.ravel()
     varies = deviation > 1e-9 * max(1.0, np.abs(r).max())
     if varies.any():
@@ -423,6 +423,10 @@ def _entry(key: _Key, entry: object, states: Labels) -> tuple[float, int, float,
     except InputError as error:
         raise InputError(f"{key}: s'", error.value, error.allowed) from error
     return p, s_next, r, None if end is None else bool(end)
+
+
+def _mask_of(allowed: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
+    return np.asarray(checks.array("allowed", allowed, shape, (lambda x: (x == 0) | (x == 1), "true or false")) == 1)
 
 
 def _missing(row: np.ndarray, n_states: int, n_actions: int) -> tuple[np.ndarray, np.ndarray]:

@@ -1,7 +1,12 @@
-"""What a run computes with, as text: two values that are not the same have other texts."""
+"""What a run computes with, as text, to tell the settings of one run from those of another.
+
+Equal values have equal texts, in every process. What differs has another text, as far as its own attributes tell: of a
+function that is its name, code, defaults, attributes and what it closes over, but not the global names that it uses.
+"""
 
 from __future__ import annotations
 
+import copyreg
 import datetime
 import decimal
 import enum
@@ -59,7 +64,7 @@ def _value(key: str, value: object, depth: int) -> Any:
     if isinstance(value, np.generic):
         number = value.dtype.kind in "biuf" and value.dtype.itemsize <= 8
         return plain(key, value.item(), depth) if number else f"{value.dtype} {value!r}"
-    if isinstance(value, (bytes, bytearray)):
+    if isinstance(value, (bytes, bytearray, memoryview)):
         return f"{len(value)} bytes, {hashlib.sha256(value).hexdigest()[:16]}"
     if isinstance(value, (int, float, str, *TOLD_BY_REPR)):  # of classes of their own, the first three
         return f"{_name(type(value))} {value!r}"
@@ -73,9 +78,11 @@ def _array(key: str, value: object, depth: int) -> Any:
         parts = (p.indptr, p.indices, p.data, value.reward, value.start, value.allowed)
         return f"{value.n_states} states, {value.n_actions} actions, {_sha256(parts)}"
     if isinstance(value, torch.Tensor):
-        value = value.detach().cpu().numpy()
+        return {"tensor": str(value.dtype), "of": _array(key, value.detach().cpu().to_dense().double().numpy(), depth)}
     if not isinstance(value, np.ndarray):
         return None
+    if type(value) is not np.ndarray:  # with attributes of its own: a mask, units
+        return _object(key, value, depth)
     if value.dtype.kind == "O":
         return {"array": list(value.shape), "entries": [plain(key, item, depth) for item in value.flat]}
     return f"array {list(value.shape)}, {_sha256((value,))}"
@@ -86,10 +93,18 @@ def _container(key: str, value: object, depth: int) -> Any:
     if is_dataclass(value) and not isinstance(value, type):
         own = {f.name: plain(f"{key}.{f.name}", getattr(value, f.name), depth) for f in fields(value)}
         return own if depth == 1 else {"class": _name(type(value)), **own}
+    if type(value) is dict and all(isinstance(item, str) for item in value):
+        return {item: plain(f"{key}.{item}", value[item], depth) for item in value}
     if isinstance(value, Mapping):
-        return {_text(key, item, depth): plain(f"{key}.{item}", value[item], depth) for item in value}
+        pairs = [[plain(key, item, depth), plain(f"{key}.{item}", value[item], depth)] for item in value]
+        own = plain(key, getattr(value, "default_factory", None), depth)
+        return {
+            "class": _name(type(value)),
+            "pairs": pairs if type(value) is not dict else sorted(pairs, key=repr),
+            "default": own,
+        }
     if isinstance(value, (set, frozenset)):
-        return {"set": sorted(_text(key, item, depth) for item in value)}
+        return {"set": sorted((plain(key, item, depth) for item in value), key=repr)}
     if isinstance(value, (list, tuple)):
         return [plain(f"{key}[{i}]", item, depth) for i, item in enumerate(value)]
     return None
@@ -121,14 +136,20 @@ def _object(key: str, value: object, depth: int) -> Any:
     if isinstance(value, (type, types.ModuleType)):
         return _name(value)
     if isinstance(value, types.FunctionType):
-        cells = [plain(key, cell.cell_contents, depth) for cell in value.__closure__ or ()]
-        return {"function": _name(value), "code": _code(value.__code__), "closed_over": cells}
+        inside = [cell.cell_contents for cell in value.__closure__ or ()]
+        parts = (inside, value.__defaults__, value.__kwdefaults__, vars(value))
+        return {"function": _name(value), "code": _code(value.__code__), "with": plain(key, parts, depth)}
     if isinstance(value, types.MethodType):
         return {"method": value.__name__, "of": plain(key, value.__self__, depth)}
     if isinstance(value, types.BuiltinFunctionType):
-        return _name(value)
+        of = value.__self__
+        named = of is None or isinstance(of, (types.ModuleType, type))
+        return _name(value) if named else {"method": value.__name__, "of": plain(key, of, depth)}
+    if (wrapped := getattr(value, "__wrapped__", None)) is not None:
+        return {"class": _name(type(value)), "of": plain(key, wrapped, depth)}
     try:
-        parts = value.__reduce_ex__(2)  # what a copy would be made of
+        reduce = copyreg.dispatch_table.get(type(value))
+        parts: Any = value.__reduce_ex__(2) if reduce is None else reduce(value)  # what a copy would be made of
     except Exception as error:  # of a lock, a file, and the like
         allowed = "a value that can be told from others: numbers, text, arrays, containers, dataclasses, functions"
         raise InputError(key, f"of class {_name(type(value))}", f"{allowed} ({error})") from error
@@ -141,13 +162,17 @@ def _object(key: str, value: object, depth: int) -> Any:
 def _code(code: types.CodeType) -> str:
     whole = hashlib.sha256(code.co_code)
     for constant in code.co_consts:
-        whole.update((_code(constant) if isinstance(constant, types.CodeType) else repr(constant)).encode())
+        whole.update(_constant(constant).encode())
     whole.update(repr((code.co_names, code.co_varnames)).encode())
     return whole.hexdigest()[:16]
 
 
-def _text(key: str, value: object, depth: int) -> str:
-    return value if isinstance(value, str) else repr(plain(key, value, depth))
+def _constant(value: object) -> str:
+    if isinstance(value, types.CodeType):
+        return _code(value)
+    if isinstance(value, frozenset):  # its order changes from process to process
+        return f"set {sorted(map(_constant, value))}"
+    return f"({', '.join(map(_constant, value))})" if isinstance(value, tuple) else repr(value)
 
 
 def _name(value: Any) -> str:  # of whatever has a name

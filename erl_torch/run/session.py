@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, overload
 
 import gymnasium as gym
+import numpy as np
 import yaml
 
 from erl_torch import checks
@@ -327,6 +328,10 @@ def _described(
         source |= plain("experience", experience)
     models = {key: plain(f"problem.{key}", getattr(problem, key)) for key in ("mdp", "episode", "horizon", "prior")}
     models["source"] = plain("problem.source", problem.source) if isinstance(problem.source, TabularMDP) else None
+    if problem.env is None:  # of a log, the names are its own
+        for key, labels in (("state_labels", problem.state_labels), ("action_labels", problem.action_labels)):
+            models[key] = None if labels is None else plain(f"problem.{key}", np.asarray(labels.texts))
+    models["ends"] = plain("problem.ends", problem.ends)
     return {
         "env": {"name": problem.name, **models, **environment(problem.env)},
         "learner": {"name": kind.__name__, "module": kind.__module__, **values},

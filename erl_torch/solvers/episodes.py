@@ -67,7 +67,7 @@ def evaluate_episodes(
         InputError: a policy that is not [S, A], no end, or a horizon below 1.
     """
     checks.instance("mdp", mdp, TabularMDP, "a TabularMDP")
-    table = check_policy("policy", policy, mdp.n_states, mdp.n_actions)
+    table = check_policy("policy", policy, mdp.n_states, mdp.n_actions, mdp.allowed)
     ended = ending(mdp, ends)
     succeeds = ended if successes is None else _mask("successes", successes, ended)
     model = absorbed(mdp, np.flatnonzero(ended), 0.0)

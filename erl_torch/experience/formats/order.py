@@ -22,7 +22,7 @@ def in_order(source: Table, roles: Roles) -> Table:
 
     Raises InputError where that takes more than ``MOST_SORTED`` rows in memory.
     """
-    if "episode" not in roles or ("s_next" in roles and "terminated" not in roles):
+    if "episode" not in roles:
         return source
     (name,) = roles["episode"]
     known: dict[Any, int] = {}  # numbers of the episodes, by their first rows
@@ -81,7 +81,8 @@ def stride_of(source: Table, roles: Roles, key: str = "") -> float:
         up = (step - before)[same | (np.arange(len(step)) == 0)]
         up = up[np.isfinite(up)]
         if len(counted) <= MOST_STRIDES:
-            different, times = np.unique(up, return_counts=True)
+            # Steps of a clock differ in their last digits.
+            different, times = np.unique(np.array([float(f"{x:.6g}") for x in up.tolist()]), return_counts=True)
             counted.update(dict(zip(different.tolist(), times.tolist(), strict=True)))
         n, lost, last = n + len(step), lost + int(np.isnan(step).sum()), (final, float(step[-1]))
     stride, most = counted.most_common(1)[0] if counted else (0.0, 0)
