@@ -808,3 +808,44 @@ def test_auto_needs_a_model(tmp_path):
     cfg = composed("experience=recorded", f"experience.path={tmp_path}/log.csv", "env.end_reward=auto")
     with pytest.raises(InputError, match=r"env.end_reward=auto: must be a number for a log"):
         train(cfg, tmp_path / "run")
+
+
+# -- clocks, episodes that stand apart, names -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("unit", [0.01, 1 / 3, 1e-3, 7.0])
+@pytest.mark.parametrize("begin", [0.0, 1.7e9])
+def test_a_clock_goes_up_by_as_much_as_it_shows(unit, begin):
+    """0.01 k as a double: differences are not the same in all digits."""
+    rng = np.random.default_rng(0)
+    step = begin + unit * np.arange(1000)
+    frame = {"s": rng.integers(3, size=1000), "a": rng.integers(2, size=1000), "r": rng.random(1000), "t": step}
+    whole = read_log(frame | {"episode": np.zeros(1000, int)})
+    assert (whole.report.before_gaps, whole.report.tuples) == (0, 999)
+    kept = np.delete(np.arange(1000), [300, 700])
+    cut = read_log({name: column[kept] for name, column in frame.items()} | {"episode": np.zeros(998, int)})
+    assert (cut.report.before_gaps, cut.report.tuples) == (2, 995)
+
+
+def test_episodes_that_stand_apart_are_put_together_with_the_state_after():
+    n = 20
+    frame = {
+        "episode": np.arange(n) % 2, "s": np.arange(n) % 3, "a": np.zeros(n, int), "r": np.ones(n),
+        "s_next": (np.arange(n) + 1) % 3,
+    }  # fmt: skip
+    assert read_log(frame).report.episodes == 2
+
+
+def test_the_names_of_a_log_belong_to_a_run(tmp_path):
+    """The same numbers under other names gave the names of the run before."""
+    learner = CertaintyEquivalence(beta=1.0)
+    quick = erl_torch.EvaluationSettings(pictures=False)
+    for states, refused in ((["a", "b"], False), (["c", "d"], True), (["a", "b"], False)):
+        frame = {"s": states * 10, "a": ["u", "v", "u"] * 6 + ["v", "u"], "r": np.arange(20.0), "episode": [0] * 20}
+        log = read_log(frame)
+        if refused:
+            with pytest.raises(InputError, match="of a run with these settings"):
+                erl_torch.train(learner, log, directory=tmp_path, evaluation=quick)
+        else:
+            found = erl_torch.train(learner, log, directory=tmp_path, evaluation=quick)
+            assert [*found.state_labels.texts] == states

@@ -824,3 +824,22 @@ def test_a_comparison_on_a_model():
     found = compare(mdp, {"ce": CertaintyEquivalence(2.0), "s1": AlgorithmS1(2.0, lr_u=0.05)}, 10, 200, seeds=2)
     assert np.isfinite(found.measures["gap"]).all()
     assert found.theta == pytest.approx(solve_soft_bellman(mdp, 2.0).theta, abs=1e-9)
+
+
+def test_an_episode_takes_no_action_that_a_state_lacks():
+    """A policy that did lost probability: bounds on a return that was too small."""
+    transition = np.zeros((2, 2, 2))
+    transition[0, 0, 1] = transition[1, :, 1] = 1.0
+    mdp = TabularMDP(transition, [[1.0, -np.inf], [0.0, 0.0]], [1.0, 0.0])
+    whole = erl_torch.evaluate_episodes(mdp, [[1.0, 0.0], [0.5, 0.5]], ends=np.array([False, True]))
+    assert whole.mean_return.low <= 1.0 <= whole.mean_return.high
+    with pytest.raises(InputError, match=r"policy\[0, 1\]"):
+        erl_torch.evaluate_episodes(mdp, [[0.5, 0.5], [0.5, 0.5]], ends=np.array([False, True]))
+
+
+@pytest.mark.parametrize("mask", [[True, False], np.ones((3, 4)), np.full((16, 4), 0.5), "all"])
+def test_a_mask_of_another_shape_is_refused(mask):
+    with pytest.raises(InputError, match="allowed"):
+        erl_torch.tabular_mdp(gym.make("FrozenLake-v1"), allowed=mask)
+    with pytest.raises(InputError, match="allowed"):
+        erl_torch.tabular_mdp(gym.make("erl_torch/WindyCliff-v0"), allowed=mask)
