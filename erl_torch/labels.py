@@ -396,7 +396,7 @@ def _part(space: gym.Space[Any]) -> _Part:
     if isinstance(space, spaces.Tuple):
         return _Product([_part(part) for part in space.spaces], None)
     if isinstance(space, spaces.Dict):
-        names = sorted(space.spaces)  # files and Gymnasium order them in several ways
+        names = sorted(map(str, space.spaces))  # files and Gymnasium order them in several ways
         return _Product([_part(space.spaces[name]) for name in names], names)
     allowed = "a finite space: Discrete, MultiDiscrete, MultiBinary, a Box of whole numbers, or Tuple and Dict of such"
     raise InputError("space", space, allowed)

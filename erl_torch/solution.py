@@ -35,7 +35,7 @@ class Status(enum.Enum):
         "Raise tol or lower beta"
     )
     REDUCIBLE = "the states that the start leads to are not one recurrent class; the message names them"
-    ILL_POSED = "a way round that never ends pays at least as much as ending; the message names it"
+    ILL_POSED = "a way round that never ends pays more than ending; the message names it"
     STOPPED = "stopped by the caller before the last pass; the tables are those of the last full epoch"
     PSI_LIMIT = "the psi phase met max_psi_epochs before psi_tol: raise max_psi_epochs or lr_psi"
     UNCERTIFIED = "the certificate is wider than asked for, as the message says; the bound holds as it stands"

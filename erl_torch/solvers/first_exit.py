@@ -90,9 +90,10 @@ def solve_first_exit(
         max_steps: linear systems at most.
 
     Returns:
-        An ExitSolution. Status ILL_POSED where a way round that never ends is worth as much as ending, or more (the
-        message names it; values are then +infinite where it can be reached), STAGNATED where rounding keeps the bounds
-        wider than ``tol``, or infinite. Other states than those solved keep the prior policy.
+        An ExitSolution. Status ILL_POSED where a way round that never ends surely pays more than ending (the message
+        names it; values are +infinite where it can be reached), STAGNATED where rounding keeps the bounds wider than
+        ``tol``, or infinite, or hides whether a way round pays (the message names it). Other states than those solved
+        keep the prior policy.
 
     Raises:
         InputError: beta, prior, ends, tol or max_steps out of range, or no end that the start leads to.
@@ -327,7 +328,8 @@ def _above(
 ) -> tuple[np.ndarray | None, float]:
     """(W, eps) with TW <= W - eps, eps > 0; (None, 0) where V + d h, and the fixed point for rewards larger by d, have
     no such margin."""
-    above = value + d * steps
+    with np.errstate(over="ignore"):
+        above = value + d * steps
     for again in range(tries):
         if not np.isfinite(above).all():
             break
@@ -376,13 +378,14 @@ def _explained(
             source = np.zeros(k + 1)
             source[np.concatenate([component.states for component in surely])] = 1.0
             infinite = reachable_from(back, source)[:k]
-        status = Status.ILL_POSED
+        status = Status.ILL_POSED if surely else Status.STAGNATED
         message = "; ".join(
             f"in {_some(inside, component.states)} {_round_actions(component)} never lead to an end, at a regularised "
             f"rate of {low:.6g} to {high:.6g}"
-            for component, low, high in paying[:3]
+            for component, low, high in sorted(paying, key=lambda found: -found[1])[:3]
         )
-        message += ": going on pays at least as much as ending (charge every step, or the failing end; or lower beta)"
+        says = "pays more than" if surely else "may pay as much as, which rounding hides,"
+        message += f": going on {says} ending (charge every step, or the failing end; or lower beta)"
     elif n_steps >= max_steps:
         status, message = Status.STEP_LIMIT, ""
     else:
