@@ -985,3 +985,28 @@ def test_the_environment_of_the_command_line_is_encoded():
     assert states is not None
     assert states.decode(703) == (31, 10, 1)
     assert actions is None
+
+
+@pytest.mark.parametrize("part", ["observation", "reward", "info"])
+def test_a_vector_hands_on_what_is_wrong_in_one_line(part):
+    """What one of its environments returned ended in NumPy's own words."""
+    wrong = {"observation": [0.5, None, "s", [1]], "reward": [10**400, None], "info": [None, [], "x"]}[part]
+
+    class Odd(gym.Env):
+        observation_space, action_space, value = gym.spaces.Discrete(3), gym.spaces.Discrete(2), None
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            self.t = 0
+            return 0, {}
+
+        def step(self, action):
+            self.t += 1
+            own = {part: self.value} if self.t == 3 else {}
+            return own.get("observation", 1), own.get("reward", 0.0), False, False, own.get("info", {})
+
+    for value in wrong:
+        kind = type("Odd", (Odd,), {"value": value})
+        for env in (kind(), gym.vector.SyncVectorEnv([kind, kind])):
+            with pytest.raises(InputError, match="step 3"):
+                erl_torch.collect(env, 2, 10)

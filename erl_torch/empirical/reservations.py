@@ -360,7 +360,9 @@ def of_theta(theta: float | None, rewards: tuple[float, float], estimate: Estima
     if estimate is None:
         return []
     away = half_widths(theta, estimate)
-    if estimate.standard_error == 0 and abs(theta - estimate.value) > CHANCELESS_ERROR * (rewards[1] - rewards[0]):
+    if estimate.standard_error == 0 and abs(theta - estimate.value) > CHANCELESS_ERROR * max(
+        rewards[1] - rewards[0], RANGE_MARGIN * max(abs(low), abs(high))
+    ):
         return [
             Reservation(
                 "theta far from the data's",

@@ -116,7 +116,11 @@ class LogReport:
             rare = f"; {self.rare_pairs:,} of them fewer than {FEW} times: {', '.join(self.rarest)}{more}"
         lines.append(("pairs (s,a)", f"{self.pairs:,} of {self.pairs + self.pairs_never_seen:,} seen{rare}"))
         if self.gaps is None:
-            lines.append(("gaps", "cannot be seen: there is neither a state after nor a step"))
+            step = self.columns.get("step")
+            why = "there is neither a state after nor a step"
+            if step is not None:
+                why = f"there is no state after, and {step} does not go up by one number from row to row"
+            lines.append(("gaps", f"cannot be seen: {why}"))
         else:
             do = "does" if self.gaps == 1 else "do"
             lines.append(("gaps", f"{_n(self.gaps, 'row')} that {do} not go on where the row before led to"))

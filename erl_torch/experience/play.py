@@ -13,6 +13,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import numbers
+import traceback
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
@@ -312,6 +313,8 @@ def _parts(result: Any) -> Any:
     if not _length_is(result, 5):
         old = ": old environments' (observation, reward, done, info) does not tell the two ends apart"
         raise InputError("what it returned", _short(result), STEP + old * _length_is(result, 4))
+    if not isinstance(result[4], dict):
+        raise InputError("info", _short(result[4]), "a dict")
     return result
 
 
@@ -335,11 +338,12 @@ def _state(observation: Any, n_states: int) -> int:
 
 
 def _reward(reward: Any) -> float:
-    if not isinstance(reward, (numbers.Real, np.bool_)) and not (isinstance(reward, np.ndarray) and reward.ndim == 0):
+    plain = isinstance(reward, np.ndarray) and reward.ndim == 0 and reward.dtype.kind in "biuf"
+    if not isinstance(reward, (numbers.Real, np.bool_)) and not plain:
         raise InputError("reward", f"{_short(reward)} ({type(reward).__name__})", "a number")
     try:
         r = float(reward)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise InputError("reward", _short(reward), "a number") from error
     if not np.isfinite(r):
         raise InputError("reward", r, "finite")
@@ -374,13 +378,17 @@ def _blamed(env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any], when: 
         yield
     except InputError as error:
         raise InputError(f"{_name(env)}, {when}: {error.key}", error.value, error.allowed) from error
-    except (AssertionError, ValueError, TypeError) as error:
-        trace = error.__traceback__
-        while trace is not None and trace.tb_next is not None:
-            trace = trace.tb_next
-        place = "" if trace is None else str(trace.tb_frame.f_globals.get("__name__"))
+    except (AssertionError, ValueError, TypeError, AttributeError, OverflowError) as error:
+        # Raised by what stands between, or by NumPy, to which it hands on what the environment returned.
+        between = False
+        for frame, _ in traceback.walk_tb(error.__traceback__):
+            place = str(frame.f_globals.get("__name__"))
+            if place.startswith(BETWEEN):
+                between = True
+            elif not place.startswith(("numpy", "functools")):
+                between = False
         old = "unexpected keyword argument" in str(error) and when == "reset"
-        if not old and not place.startswith(BETWEEN):
+        if not old and not between:
             raise
         cause = " ".join(str(error).split())
         kind = type(env.unwrapped).__name__

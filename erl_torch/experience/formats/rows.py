@@ -149,6 +149,8 @@ class Rows:
             if len(batch["s"]):
                 yield batch
         self.seen.bad += self._source.invalid
+        if self._source.invalid and not self.seen.first_bad:
+            self.seen.first_bad = "a row with another number of columns"
         self.short = self.seen.bad
 
     def _as_they_are(self, rows: int, strict: bool) -> Iterator[Batch]:
