@@ -49,7 +49,9 @@ class InputError(ValueError):
         return " ".join(f"{self.key}={_text(self.value)}: must be {self.allowed}".split())
 
     def within(self, group: str) -> InputError:
-        """The same error with ``group.`` before the key."""
+        """The same error with ``group.`` before the key; a key that names a place ("ENV, step 3: ...") stays."""
+        if ", " in self.key:
+            return self
         return InputError(f"{group}.{self.key}", self.value, self.allowed)
 
     def of_file(self, path: str | os.PathLike[str]) -> InputError:

@@ -312,3 +312,49 @@ def test_other_forms_are_checked(make, said):
     with pytest.raises(InputError) as caught:
         make(random_tables(0)[0])
     assert said in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("srew", "trew", "said"),
+    [
+        ("4 2\n2 1.5\n", None, "first line=4 2: must be 4 1, for its model and its lines"),
+        ("9 1\n2 1.5\n", None, "must be 4 1"),
+        ("2 1.5\n1 6\n", None, "must be 4 1"),
+        ("4 2\n2 1.5\n2 3\n", None, "a state that comes once"),
+        ("4 1\n2\n", None, "line 2=2: must be STATE NUMBER"),
+        (None, "4 6 2\n1 0 3 -1\n", "must be 4 6 1"),
+        (None, "4 6 1\n1 0 1 -1\n", "of a transition that the model has"),
+        (None, "4 6 2\n1 0 3 -1\n1 0 3 2\n", "a transition that comes once"),
+    ],
+)
+def test_rewards_of_prism_are_those_of_the_model(tmp_path, srew, trew, said):
+    paths = [tmp_path / name for name in ("m.tra", "m.srew", "m.trew")]
+    for path, text in zip(paths, (ROBOT, srew, trew), strict=True):
+        path.write_text(text or "")
+    with pytest.raises(InputError) as caught:
+        TabularMDP.from_prism(paths[0], srew and paths[1], trew and paths[2])
+    assert said in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: TabularMDP.from_outcomes(2, 2, None),
+        lambda: TabularMDP.from_outcomes(2, 2, lambda s, a: 3),
+        lambda: TabularMDP.from_outcomes(10**6, 10**6, lambda s, a: []),
+        lambda: TabularMDP.from_pairs([0, 1], [0, 2 * 10**9], np.eye(2), [1, 2]),
+        lambda: TabularMDP.from_pairs([0, 1], np.array([0, 2**63], np.uint64), np.eye(2), [1, 2]),
+        lambda: TabularMDP.from_prism(None),
+    ],
+)
+def test_what_no_model_can_be_made_of_is_one_line(make):
+    with pytest.raises(InputError):
+        make()
+
+
+def test_a_pair_of_no_reward_is_missing():
+    mdp = TabularMDP.from_pairs([0, 0, 1], [0, 1, 0], np.eye(2)[[1, 0, 0]], [1.0, -np.inf, 2.0])
+    assert mdp.allowed.tolist() == [[True, False], [True, False]]
+    same(TabularMDP.from_outcomes(2, 1, lambda s, a: [(1.0, 1 - s, s + 1.0)] if a == 0 else None), TabularMDP(
+        np.eye(2)[[1, 0]].reshape(2, 1, 2), [[1.0], [2.0]]
+    ))  # fmt: skip

@@ -932,3 +932,35 @@ def test_a_metric_that_is_no_number_is_not_drawn(tmp_path, tuples):
 def test_what_is_not_set_is_no_hyperparameter():
     settings = {"env": {"name": "lake", "kwargs": {}, "bins": None, "size": 3}, "learner": {"name": "s1"}, "seed": 0}
     assert hyperparameters(settings) == {"env": "lake", "learner": "s1", "env.size": 3, "seed": 0}
+
+
+@pytest.mark.parametrize("values", [(Mode.A, Mode.B), (np.arange(2), np.arange(3)), (Path("a"), Path("b"))])
+def test_objects_make_groups(tmp_path, tuples, values):
+    """All was learnt, and then no JSON held them."""
+
+    @dataclass(frozen=True, eq=False)
+    class Own(AlgorithmS1):
+        w: Any = None
+
+    replicas = Replicas(tuple(Own(n_epochs=1, n_bias=1, w=value) for value in values))
+    erl_torch.train(replicas, MDP, tuples, directory=tmp_path, evaluation=QUICK)
+    groups = json.loads((tmp_path / "result.json").read_text())["groups"]
+    assert len({json.dumps(group["settings"]) for group in groups}) == 2
+
+
+@pytest.mark.parametrize("name", ["iterate", "run", "start"])
+def test_replicas_refuse_what_they_would_pass_over(name):
+    kind = type("Own", (AlgorithmS1,), {name: lambda self, *_: iter(())})
+    with pytest.raises(InputError, match=f"one with the {name} of StreamLearner"):
+        Replicas.of(kind(), 2)
+
+
+def test_a_source_of_another_environment_is_another_run(tmp_path):
+    lake = gym.make("FrozenLake-v1", max_episode_steps=10)
+    for source, refused in ((lake, False), (gym.wrappers.TransformReward(lake, lambda r: 2 * float(r)), True)):
+        problem = erl_torch.Problem(lake, source, np.full((16, 4), 0.25))
+        if refused:
+            with pytest.raises(InputError, match="of a run with these settings"):
+                erl_torch.train(SHORT, problem, Simulate(5, 20), directory=tmp_path, evaluation=QUICK)
+        else:
+            erl_torch.train(SHORT, problem, Simulate(5, 20), directory=tmp_path, evaluation=QUICK)

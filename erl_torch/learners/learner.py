@@ -295,6 +295,8 @@ def as_told(learner: Any, problem: Problem) -> tuple[Any, Problem]:
     it was stepped; the shares of those that are left stay."""
     if problem.masks is None or problem.masks.allowed.all():
         return learner, problem
+    if hasattr(learner, "learners"):
+        learner.prior_policy(problem.n_states, problem.n_actions)  # the one of all
     kept = problem.prior * problem.allowed
     prior = kept / kept.sum(1, keepdims=True)
     return _of_prior(learner, prior), replace(problem, prior=prior)

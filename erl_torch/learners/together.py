@@ -47,10 +47,24 @@ class Together:
         return self.threads or os.cpu_count() or 1
 
     def prior_policy(self, n_states: int, n_actions: int) -> np.ndarray:
-        """[S, A], the one of all replicas."""
-        return check_policy("prior_policy", self.learners[0].prior_policy, n_states, n_actions)
+        """[S, A], the one of all replicas. Raises InputError where they have several."""
+        prior = check_policy("prior_policy", self.learners[0].prior_policy, n_states, n_actions)
+        for r, learner in enumerate(self.learners):
+            own = learner.prior_policy
+            if own is not self.learners[0].prior_policy and not np.array_equal(
+                check_policy("prior_policy", own, n_states, n_actions), prior
+            ):
+                raise InputError(f"learners[{r}].prior_policy", "array", "that of all replicas")
+        return prior
+
+
+OWN = ("iterate", "run", "start")  # of ``StreamLearner``: replicas step each learner themselves
 
 
 def check_learner(key: str, learner: object) -> None:
     if not isinstance(learner, StreamLearner) or not is_dataclass(learner):
         raise InputError(key, f"{learner} ({type(learner).__name__})", "a learner that streams, as AlgorithmS1()")
+    others = [name for name in OWN if getattr(type(learner), name) is not getattr(StreamLearner, name)]
+    if others:
+        allowed = f"one with the {', '.join(others)} of StreamLearner: replicas call its prepare and step themselves"
+        raise InputError(key, type(learner).__name__, allowed)

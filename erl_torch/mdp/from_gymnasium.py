@@ -270,13 +270,18 @@ def _failures(rule: Rule, reward: np.ndarray, end: np.ndarray, n_states: int) ->
     return Failures.of(rule, float(reward[end].max(initial=-np.inf)), n_states)
 
 
+def name_of(env: gym.Env[Any, Any]) -> str:
+    """What messages call an environment: its id, or its class."""
+    return env.spec.id if env.spec is not None else type(env.unwrapped).__name__
+
+
 def _check_known(env: gym.Env[Any, Any]) -> None:
     checks.instance("env", env, gym.Env, "an environment of Gymnasium's")
     if (own := overridden(env)) is not None:
-        raise InputError("env", env, f"one whose model describes its steps: {own} ({INSIST})")
+        raise InputError("env", name_of(env), f"one whose model describes its steps: {own} ({INSIST})")
     changed = changed_by(env)
     if changed is not None:
-        raise InputError("env", env, f"without {changed}, under which the model is not known")
+        raise InputError("env", name_of(env), f"without {changed}, under which the model is not known")
 
 
 def absorbing(mdp: TabularMDP) -> np.ndarray:

@@ -20,6 +20,7 @@ from erl_torch import checks
 from erl_torch.checks import InputError
 
 Arrays: TypeAlias = tuple[sp.csr_array, np.ndarray]
+MOST_PAIRS = 2**31 - 1  # pairs have numbers of 32 bits
 Outcomes = Callable[[int, int], Iterable[tuple[float, int, float]]]
 
 
@@ -30,6 +31,9 @@ def of_outcomes(n_states: int, n_actions: int, outcomes: Outcomes) -> Arrays:
     """See ``TabularMDP.from_outcomes``."""
     checks.at_least("n_states", n_states, 1)
     checks.at_least("n_actions", n_actions, 1)
+    checks.room("n_states * n_actions", (n_states, n_actions))
+    if not callable(outcomes):
+        raise InputError("outcomes", type(outcomes).__name__, "a function of (s, a)")
     data: list[float] = []
     columns: list[int] = []
     ends = [0]
@@ -37,7 +41,7 @@ def of_outcomes(n_states: int, n_actions: int, outcomes: Outcomes) -> Arrays:
     for s in range(n_states):
         for a in range(n_actions):
             parts = []
-            for entry in outcomes(s, a):
+            for entry in _listed(f"outcomes({s}, {a})", outcomes(s, a)):
                 p, to, r = _outcome(f"outcomes({s}, {a})", entry, n_states)
                 data.append(p)
                 columns.append(to)
@@ -46,6 +50,12 @@ def of_outcomes(n_states: int, n_actions: int, outcomes: Outcomes) -> Arrays:
                 reward[s, a] = math.fsum(parts)
             ends.append(len(data))
     return sp.csr_array((data, columns, ends), shape=(n_states * n_actions, n_states)), reward
+
+
+def _listed(key: str, entries: Any) -> Iterable[Any]:
+    if entries is not None and not isinstance(entries, Iterable):
+        raise InputError(key, entries, "entries (probability, s', reward), or none")
+    return () if entries is None else entries
 
 
 def _outcome(key: str, entry: Any, n_states: int) -> tuple[float, int, float]:  # whatever the caller's function gives
@@ -125,12 +135,17 @@ def mean_reward(transition: sp.csr_array, reward: Any) -> np.ndarray:
 def of_pairs(states: ArrayLike, actions: ArrayLike, transition: object, reward: ArrayLike) -> Arrays:
     """See ``TabularMDP.from_pairs``."""
     s, a = _indices("states", states), _indices("actions", actions)
-    paid = checks.array("reward", reward, ("n_pairs",))
+    paid = checks.array("reward", reward, ("n_pairs",), (lambda x: ~np.isnan(x) & (x < np.inf), "finite, or -inf"))
     for key, column in (("states", s), ("actions", a)):
         if len(column) != len(paid):
             raise InputError(key, f"{len(column)} entries", f"{len(paid)} entries, as reward has")
     rows = checks.sparse("transition", transition, (len(paid), "n_states"))
     n_states, n_actions = rows.shape[1], int(a.max()) + 1
+    if n_states * n_actions > MOST_PAIRS:
+        raise InputError(
+            "actions", int(a.max()), f"below {MOST_PAIRS // n_states}: each state has a row for each action"
+        )
+    checks.room("reward", (n_states, n_actions))
     if s.max() >= n_states:
         raise InputError("states", int(s.max()), f"below {n_states}, as transition has {n_states} columns")
     pair = s * n_actions + a
@@ -146,9 +161,10 @@ def of_pairs(states: ArrayLike, actions: ArrayLike, transition: object, reward: 
 
 def _indices(key: str, value: ArrayLike) -> np.ndarray:
     column = checks.real(key, value)
-    if column.ndim != 1 or not column.size or column.dtype.kind not in "iu" or column.min() < 0:
+    whole = column.ndim == 1 and column.size and column.dtype.kind in "iu"
+    if not whole or column.min() < 0 or column.max() > checks.LARGEST_INTEGER:
         raise InputError(key, f"{column.dtype} array of shape {column.shape}", "whole numbers >= 0, [n_pairs]")
-    return column.astype(np.int64)
+    return np.asarray(column.astype(np.int64))
 
 
 def of_quantecon(problem: Any) -> Arrays:
@@ -187,26 +203,69 @@ def of_prism(
     if len(entries) != int(_whole(transitions, 1, header[-1])):
         raise InputError(f"path={transitions}", f"{len(entries)} transitions", f"{header[-1]}, as its first line says")
     n_actions = 1 + max((a for _, a, _, _ in entries), default=0)
+    if n_states * n_actions > MOST_PAIRS:
+        raise InputError(
+            f"path={transitions}", f"{n_states} states, choices up to {n_actions - 1}", "fewer than 2**31 pairs"
+        )
+    checks.room(f"path={transitions}: states * choices", (n_states, n_actions))
     row = np.array([s * n_actions + a for s, a, _, _ in entries], np.int64)
     to = np.array([t for _, _, t, _ in entries], np.int64)
     shape = (n_states * n_actions, n_states)
     rows = sp.csr_array((np.array([p for *_, p in entries]), (row, to)), shape=shape)
-    reward = np.where(np.bincount(row, minlength=shape[0]) > 0, 0.0, -np.inf)
+    present = np.bincount(row, minlength=shape[0]) > 0
+    if not chain and _whole(transitions, 1, header[1]) != present.sum():
+        raise InputError(f"path={transitions}", f"{present.sum()} choices", f"{header[1]}, as its first line says")
+    reward = np.where(present, 0.0, -np.inf)
     if state_rewards is not None:
-        per_state = np.zeros(n_states)
-        for n, words in _prism_lines(state_rewards)[1]:
-            s = _below(state_rewards, n, words[0], n_states)
-            per_state[s] = _real(state_rewards, n, words[-1])
-        reward += np.repeat(per_state, n_actions)
+        reward += np.repeat(_prism_state_rewards(state_rewards, n_states), n_actions)
     if transition_rewards is not None:
-        paid = sp.dok_array(shape)
-        for n, words in _prism_lines(transition_rewards)[1]:
-            s, a, t, r = _prism_entry(transition_rewards, n, words, chain, n_states)
-            if a >= n_actions:
-                raise InputError(f"path={transition_rewards}: line {n}", a, f"a choice below {n_actions}")
-            paid[s * n_actions + a, t] = r
-        reward += mean_reward(rows, paid.tocsr())
+        reward += mean_reward(rows, _prism_transition_rewards(transition_rewards, chain, rows, header))
     return rows, reward.reshape(n_states, n_actions)
+
+
+def _prism_state_rewards(path: str | os.PathLike[str], n_states: int) -> np.ndarray:
+    header, lines = _prism_lines(path)
+    _check_header(path, header, [str(n_states)], len(lines))
+    found: dict[int, float] = {}
+    for n, words in lines:
+        if len(words) != 2:
+            raise InputError(f"path={path}: line {n}", " ".join(words), "STATE NUMBER")
+        s = _below(path, n, words[0], n_states)
+        if s in found:
+            raise InputError(f"path={path}: line {n}", s, "a state that comes once")
+        found[s] = _real(path, n, words[1])
+    return np.array([found.get(s, 0.0) for s in range(n_states)])
+
+
+def _prism_transition_rewards(
+    path: str | os.PathLike[str], chain: bool, rows: sp.csr_array, model: Sequence[str]
+) -> sp.csr_array:
+    """r(s, a, s') [S*A, S] of the transitions that ``rows`` has; ``model`` is the first line of their file."""
+    header, lines = _prism_lines(path)
+    _check_header(path, header, model[:-1], len(lines))
+    n_states = rows.shape[1]
+    n_actions = rows.shape[0] // n_states
+    there = sp.csr_array(rows > 0)
+    found: dict[tuple[int, int], float] = {}
+    for n, words in lines:
+        s, a, to, r = _prism_entry(path, n, words, chain, n_states)
+        place = (s * n_actions + a, to)
+        if a >= n_actions or not there[place]:
+            raise InputError(f"path={path}: line {n}", " ".join(words), "of a transition that the model has")
+        if place in found:
+            raise InputError(f"path={path}: line {n}", " ".join(words), "a transition that comes once")
+        found[place] = r
+    index = np.array([*found], np.int64).reshape(-1, 2)
+    return sp.csr_array((np.array([*found.values()]), (index[:, 0], index[:, 1])), shape=rows.shape)
+
+
+def _check_header(path: str | os.PathLike[str], header: Sequence[str], sizes: Sequence[str], n: int) -> None:
+    """Raise InputError unless a file of rewards says the sizes of its model, and how many lines follow."""
+    expected = [*sizes, str(n)]
+    if [*header] != expected:
+        raise InputError(
+            f"path={path}: first line", " ".join(header), f"{' '.join(expected)}, for its model and its lines"
+        )
 
 
 def prism_start(labels: str | os.PathLike[str], n_states: int) -> np.ndarray:
@@ -228,7 +287,7 @@ def _read_lines(path: str | os.PathLike[str]) -> list[tuple[int, list[str]]]:
     """(number from 1, words) of the lines that are neither empty nor a comment. Raises InputError."""
     try:
         text = Path(path).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, UnicodeDecodeError, TypeError, ValueError) as error:
         raise InputError("path", path, f"a text file that can be read ({error})") from error
     rows = [(n, line.split("#")[0].split()) for n, line in enumerate(text.splitlines(), 1)]
     rows = [(n, words) for n, words in rows if words]
@@ -254,7 +313,7 @@ def _prism_entry(
 
 
 def _whole(path: str | os.PathLike[str], line: int, word: str) -> int:
-    if not (word.isascii() and word.isdigit()):
+    if not (word.isascii() and word.isdigit() and len(word) < 19):
         raise InputError(f"path={path}: line {line}", word, "a whole number >= 0")
     return int(word)
 

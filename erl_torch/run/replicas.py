@@ -32,6 +32,7 @@ from erl_torch.problem import Problem
 from erl_torch.rng import streams
 from erl_torch.run.checkpoint import Content
 from erl_torch.run.groups import MOST_LOGGED, Group, Record, setting_text, statistics
+from erl_torch.run.identity import plain
 from erl_torch.run.judge import (
     SMALL,
     DataJudge,
@@ -244,13 +245,18 @@ class ReplicaRecorder:
             "learner": self.title.learner,
             "seed": int(self.seeds[0]),
             "n_replicas": self._n_each,
-            "vary": dict(self.vary),
+            "vary": {key: plain(f"vary.{key}", values, 1) for key, values in self.vary.items()},
             "status": Status.STOPPED.name.lower() if stopped else _status(solution),
             "message": f"{type(stopped).__name__}: {stopped}" if isinstance(stopped, Exception) else "",
             "failures": {str(r): str(error) for r, error in solution.failures.items()},
             "objective": max(objectives, default=None),  # of the best group
             "groups": [
-                {"settings": dict(group.settings), "beta": group.beta, "exact": optimum, **row}
+                {
+                    "settings": {k: plain(k, v, 1) for k, v in group.settings.items()},
+                    "beta": group.beta,
+                    "exact": optimum,
+                    **row,
+                }
                 for group, optimum, row in zip(self.groups, self.optima, rows, strict=True)
             ],
             "data_half_widths": self._half_widths(solution),

@@ -94,9 +94,10 @@ def train(
     the run is damaged, and no global setting is changed, unless ``talks``. Notes are warnings of class ``Note``, once
     the run is written.
 
-    What a run is of, is the learner and its settings, the tuples, the model where it is known, and what Gymnasium knows
-    of the environment; a directory of another run is refused. Of an environment that was not made by ``gymnasium.make``
-    and has no model only the class is known. Two runs at once in one process need processes, not threads.
+    What a run is of, is the learner and its settings, the tuples (of a ``Source`` its settings), the model where it is
+    known, and what Gymnasium knows of the environment; a directory of another run is refused. Of an environment that
+    was not made by ``gymnasium.make`` and has no model only the class is known. Two runs at once in one process need
+    processes, not threads.
 
     Args:
         learner: one learner, an exact solver, or ``Replicas``.
@@ -327,7 +328,10 @@ def _described(
     if isinstance(experience, (Source, Simulation)):
         source |= plain("experience", experience)
     models = {key: plain(f"problem.{key}", getattr(problem, key)) for key in ("mdp", "episode", "horizon", "prior")}
-    models["source"] = plain("problem.source", problem.source) if isinstance(problem.source, TabularMDP) else None
+    if isinstance(problem.source, TabularMDP):
+        models["source"] = plain("problem.source", problem.source)
+    elif problem.source is not None and problem.source is not problem.env:
+        models["source"] = environment(problem.source)
     if problem.env is None:  # of a log, the names are its own
         for key, labels in (("state_labels", problem.state_labels), ("action_labels", problem.action_labels)):
             models[key] = None if labels is None else plain(f"problem.{key}", np.asarray(labels.texts))
