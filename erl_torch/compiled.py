@@ -40,11 +40,13 @@ def announcement() -> str:
 
 
 def _can_be_written(folder: str) -> bool:
-    """Whether files can be written in ``folder``, or it can be made."""
-    path = Path(folder).absolute()
-    while not path.exists() and path != path.parent:
-        path = path.parent
-    return path.is_dir() and os.access(path, os.W_OK | os.X_OK)
+    """Whether files can be written in ``folder``, which is made if it can be."""
+    try:
+        os.makedirs(folder, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return True
+    except OSError:
+        return False
 
 
 def _of_this_user() -> Path:

@@ -160,6 +160,12 @@ class Judge:
         return chain
 
 
+def _kl_among(policy: np.ndarray, prior: np.ndarray, mask: np.ndarray) -> float:
+    """KL(policy || prior) in one state, of their shares of the actions in ``mask``, as they are played."""
+    p, q = np.where(mask, policy, 0.0), np.where(mask, prior, 0.0)
+    return float(kl_per_state((p / p.sum())[None], (q / max(q.sum(), np.finfo(float).tiny))[None])[0])
+
+
 def _evaluate_by_playing(
     env: gym.Env[Any, Any],
     policy: np.ndarray,
@@ -172,6 +178,7 @@ def _evaluate_by_playing(
     masked: bool,
 ) -> Evaluation:
     kl = kl_per_state(policy, prior)
+    of_masks: dict[int, float] = {}  # KL of what is played, in states whose actions are masked
     batch = batched(env)
     if batch is not None:
         uniform = np.full(policy.shape, 1 / policy.shape[1])  # a' is drawn, and not looked at
@@ -181,9 +188,14 @@ def _evaluate_by_playing(
     total = total_kl = charged = 0.0
     n_steps = n_successes = 0
     for _ in range(n_episodes):
-        for step in episode(env, reset(env, rng), choose, horizon):
+        first = reset(env, rng)
+        mask = first.mask
+        for step in episode(env, first, choose, horizon):
             total += step.r
-            total_kl += kl[step.s]
+            if masked and mask is not None and step.s not in of_masks:
+                of_masks[step.s] = _kl_among(policy[step.s], prior[step.s], mask)
+            total_kl += of_masks.get(step.s, kl[step.s])
+            mask = step.mask
             n_steps += 1
             if step.terminated and ends is not None:
                 failed, more = ends.of(step.r, step.s_next)

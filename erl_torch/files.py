@@ -38,9 +38,11 @@ def _write(path: str | os.PathLike[str], fill: Callable[[BinaryIO], None]) -> Pa
 
 
 def here(path: Path) -> Path:
-    """A path as a user would write it: below the working directory, or in full."""
+    """A path as a user would write it: below the working directory, or in full; so that itself, where the program may
+    have gone alone (hydra.job.chdir)."""
+    whole = path.resolve()
     with contextlib.suppress(ValueError):
-        return path.resolve().relative_to(Path.cwd())
+        return whole if whole == Path.cwd() else whole.relative_to(Path.cwd())
     return path
 
 

@@ -849,3 +849,23 @@ def test_the_names_of_a_log_belong_to_a_run(tmp_path):
         else:
             found = erl_torch.train(learner, log, directory=tmp_path, evaluation=quick)
             assert [*found.state_labels.texts] == states
+
+
+def test_a_row_that_cannot_be_split_hides_no_step(tmp_path):
+    """Left out, it made the row before lead to the row after it."""
+    lines = [json.dumps({"s": s, "a": 0, "r": 1.0, "episode": 0}) for s in "abcd"]
+    for name, text in (
+        ("log.csv", "s,a,r,episode\na,0,1,0\nb,0,1,0\nc,0\nd,0,1,0\n"),
+        ("log.jsonl", "\n".join([*lines[:2], '{"s": ', lines[3]])),
+    ):
+        (tmp_path / name).write_text(text)
+        with pytest.raises(InputError):
+            read_log(tmp_path / name)
+        with pytest.raises(InputError, match="1 lines that are no rows: must be mended"):
+            read_log(tmp_path / name, on_bad="skip")
+    whole = tmp_path / "whole.jsonl"
+    row = {"s": "a", "a": 0, "r": 1.0, "s_next": "a"}
+    whole.write_text(f"{json.dumps(row)}\n{{\n{json.dumps(row)}\n")
+    log = read_log(whole, on_bad="skip")
+    assert (log.report.tuples, log.report.bad) == (2, 1)
+    assert "1 bad row (the first is a line that is no row)" in str(log.report)

@@ -843,3 +843,46 @@ def test_a_mask_of_another_shape_is_refused(mask):
         erl_torch.tabular_mdp(gym.make("FrozenLake-v1"), allowed=mask)
     with pytest.raises(InputError, match="allowed"):
         erl_torch.tabular_mdp(gym.make("erl_torch/WindyCliff-v0"), allowed=mask)
+
+
+class Masked(gym.Env):
+    """One state, three actions, of which the mask leaves two; every step pays 0."""
+
+    observation_space, action_space = gym.spaces.Discrete(1), gym.spaces.Discrete(3)
+    info = {"action_mask": np.array([1, 1, 0], np.int8)}  # noqa: RUF012
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return 0, self.info
+
+    def step(self, action):
+        assert action < 2
+        return 0, 0.0, False, False, self.info
+
+
+@pytest.mark.parametrize(
+    ("policy", "prior", "kl"),
+    [
+        ([0.5, 0.5, 0], None, 0.0),
+        ([1 / 3] * 3, None, 0.0),
+        ([1 / 3] * 3, [0.5, 0.5, 0], 0.0),
+        ([0.9, 0.1, 0], None, 0.9 * np.log(1.8) + 0.1 * np.log(0.2)),
+        ([0.45, 0.05, 0.5], [0.5, 0.5, 0], 0.9 * np.log(1.8) + 0.1 * np.log(0.2)),
+    ],
+)
+def test_what_is_played_is_judged(policy, prior, kl):
+    """The KL was that of the table, masked actions and all."""
+    rng = np.random.default_rng(0)
+    given = None if prior is None else np.array([prior])
+    found = erl_torch.evaluate(Masked(), np.array([policy]), 2.0, rng, 3, 10, given)
+    assert found.objective == pytest.approx(-kl / 2.0, abs=1e-12)
+
+
+def test_the_bias_of_a_missing_action_is_none():
+    transition = np.random.default_rng(0).dirichlet(np.ones(3), (3, 3))
+    allowed = np.array([[True, True, False], [True, False, True], [True, True, True]])
+    mdp = TabularMDP(transition, np.random.default_rng(1).random((3, 3)), allowed=allowed)
+    data = erl_torch.collect(mdp, 10, 500)
+    learnt = erl_torch.CertaintyEquivalence(beta=3.0, prior_policy=mdp.uniform_policy).fit(data, 3, 3)
+    assert (learnt.reward_bias.numpy()[~allowed] == 0).all()
+    assert (learnt.reward_bias.numpy()[allowed] > 0).all()

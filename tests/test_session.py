@@ -51,7 +51,7 @@ from erl_torch.log.tensorboard import hyperparameters
 from erl_torch.run.checkpoint import check_state, decode, encode
 from erl_torch.run.groups import Group, Record
 from erl_torch.run.identity import plain
-from erl_torch.run.replicas import _status
+from erl_torch.run.replicas import ReplicaRecorder, _status
 from erl_torch.run.training import train as train_configured
 from erl_torch.solvers.policy import objective
 
@@ -964,3 +964,60 @@ def test_a_source_of_another_environment_is_another_run(tmp_path):
                 erl_torch.train(SHORT, problem, Simulate(5, 20), directory=tmp_path, evaluation=QUICK)
         else:
             erl_torch.train(SHORT, problem, Simulate(5, 20), directory=tmp_path, evaluation=QUICK)
+
+
+def test_replicas_stopped_twice_between_records(tmp_path, tuples, monkeypatch):
+    """The checkpoint of the first stop shared its steps with what the end wrote: no attempt came to its end again."""
+    replicas = Replicas.of(Failing(n_epochs=4, n_bias=2), 2)
+    rare = dataclasses.replace(QUICK, every=4)
+
+    def learnt(name):
+        return erl_torch.train(replicas, MDP, tuples, directory=tmp_path / name, evaluation=rare)
+
+    monkeypatch.setattr(Failing, "good", 10**9)
+    learnt("whole")
+    monkeypatch.setattr(Failing, "good", 6)
+    with monkeypatch.context() as patch:
+        patch.setattr(ReplicaRecorder, "finish", raising(KeyboardInterrupt()))
+        with pytest.raises(KeyboardInterrupt):
+            learnt("cut")
+    monkeypatch.setattr(Failing, "good", 10**9)
+    learnt("cut")
+    assert (tmp_path / "cut/replicas.npz").read_bytes() == (tmp_path / "whole/replicas.npz").read_bytes()
+    assert scalars(tmp_path / "cut") == scalars(tmp_path / "whole")
+
+
+def test_a_replica_whose_policy_is_lost_has_failed(tmp_path, tuples):
+    with pytest.raises(NonFiniteError, match=r"2 of 2 replicas"):
+        erl_torch.train(Replicas.of(Diverging(), 2), MDP, tuples, directory=tmp_path, evaluation=QUICK)
+    assert np.isfinite(np.load(tmp_path / "replicas.npz")["policy"]).all()
+
+
+def test_an_end_that_cannot_be_written_keeps_a_checkpoint(tmp_path, tuples, monkeypatch):
+    for name in ("save", "result"):
+        for error in (OSError("disk full"), KeyboardInterrupt()):
+            directory = tmp_path / f"{name}-{type(error).__name__}"
+            with monkeypatch.context() as patch:
+                patch.setattr(f"erl_torch.run.single.SingleRecorder.{name}", raising(error))
+                with pytest.raises(type(error)):
+                    erl_torch.train(SHORT, MDP, tuples, directory=directory, evaluation=QUICK, checkpoint_every=None)
+            with monkeypatch.context() as patch:  # nothing is learnt anew
+                patch.setattr(AlgorithmS1, "step", raising(AssertionError("learnt anew")))
+                assert (
+                    erl_torch.train(
+                        SHORT, MDP, tuples, directory=directory, evaluation=QUICK, checkpoint_every=None
+                    ).gap
+                    is not None
+                )
+
+
+def test_replicas_that_play_are_judged_at_their_end(tmp_path, monkeypatch):
+    """The figures were the prior's, of the last milestone."""
+    env = gym.make("FrozenLake-v1", max_episode_steps=20)
+    monkeypatch.setattr(Failing, "good", 3)
+    with pytest.raises(KeyboardInterrupt):
+        erl_torch.train(
+            Replicas.of(Failing(beta=5.0, n_epochs=5), 2), env, Simulate(20, 20), directory=tmp_path, evaluation=QUICK
+        )
+    arrays = np.load(tmp_path / "replicas.npz")
+    assert arrays["record_step/objective"][-1] == arrays["record_step/theta"][-1] > 0

@@ -4,7 +4,7 @@ import contextlib
 import itertools
 import sys
 import textwrap
-from functools import partial
+from functools import partial, partialmethod
 from typing import Any
 
 import gymnasium as gym
@@ -1010,3 +1010,38 @@ def test_a_vector_hands_on_what_is_wrong_in_one_line(part):
         for env in (kind(), gym.vector.SyncVectorEnv([kind, kind])):
             with pytest.raises(InputError, match="step 3"):
                 erl_torch.collect(env, 2, 10)
+
+
+def paying(self, action):
+    return 0, 99.0, False, False, {}
+
+
+class Counting(FrozenLakeEnv):
+    """Its step is its parent's."""
+
+    model_holds = True
+
+    def step(self, action):
+        return super().step(action)
+
+
+@pytest.mark.parametrize(
+    "own",
+    [
+        type("Derived", (Counting,), {"step": paying}),
+        type("Partial", (FrozenLakeEnv,), {"step": partialmethod(paying)}),
+        type("Property", (FrozenLakeEnv,), {"step": property(lambda self: lambda action: paying(self, action))}),
+    ],
+)
+def test_a_word_is_not_inherited_by_another_step(own):
+    """The model of the lake was proven bounds of."""
+    with pytest.raises(InputError, match="one whose model describes its steps"):
+        erl_torch.tabular_mdp(own())
+
+
+@pytest.mark.filterwarnings("ignore::erl_torch.MeanRewardWarning")
+def test_a_class_that_was_patched_is_not_believed(monkeypatch):
+    assert erl_torch.tabular_mdp(Counting()).n_states == 16
+    monkeypatch.setattr(FrozenLakeEnv, "step", paying)
+    with pytest.raises(InputError, match="step of FrozenLakeEnv was replaced"):
+        erl_torch.tabular_mdp(FrozenLakeEnv())

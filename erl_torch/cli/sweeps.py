@@ -194,6 +194,7 @@ def averages(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         return []
     found = []
     for overrides, members in groups.items():
+        members = [row for row in members if any(row[name] is not None for name in FIGURES)]
         average: dict[str, Any] = {"overrides": list(overrides), "jobs": len(members)}
         for name in FIGURES:
             values = [row[name] for row in members if row[name] is not None]

@@ -21,7 +21,7 @@ from erl_torch import checks
 from erl_torch.empirical.counts import EmpiricalMDP, EmpiricalProblem, empirical_mdp
 from erl_torch.experience.experience import Experience
 from erl_torch.learners.learner import StreamLearner, columns, message
-from erl_torch.mdp.tabular import check_prior
+from erl_torch.mdp.tabular import check_policy, check_prior
 from erl_torch.solution import Solution, Status, proven
 from erl_torch.solvers.soft_bellman import solve_problem
 
@@ -135,9 +135,14 @@ class CertaintyEquivalence(StreamLearner[CertaintyEquivalenceState, CertaintyEqu
         with np.errstate(over="ignore", under="ignore"):
             rho = float(np.exp(-self.beta * (theta + answer.reward_bias_max))) if answer.rho is None else answer.rho
         known = torch.from_numpy(part.used | ~part.used.any(1, keepdims=True))
+        reward_bias = answer.reward_bias
+        if self.prior_policy is not None:  # actions that a state lacks have none
+            prior = check_policy("prior_policy", self.prior_policy, *reward_bias.shape)
+            reward_bias = reward_bias * torch.from_numpy(prior > 0)
         answer = replace(
             answer,
             u=answer.u * known,
+            reward_bias=reward_bias,
             theta=theta,
             rho=rho,
             theta_bounds=None,  # what is proven of the empirical model is not proven of the true one
@@ -154,7 +159,7 @@ class CertaintyEquivalence(StreamLearner[CertaintyEquivalenceState, CertaintyEqu
             u=answer.u,
             rho=rho,
             theta=theta,
-            reward_bias=answer.reward_bias,
+            reward_bias=reward_bias,
             empirical_width=upper - lower,
             answer=answer,
         )

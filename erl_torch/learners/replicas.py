@@ -360,6 +360,8 @@ def each(
                 stream = learners[r].prepare(tuples_of(experience, r, prior), n_states, n_actions)
                 held[r] = stream if hold else None
             after: StreamState = learners[r].step(states[r], stream)
+            if not torch.isfinite(after.policy).all():
+                raise NonFiniteError(after.n_tuples, "the policy has probabilities that are no numbers")
             return after
         except NonFiniteError as error:
             return error

@@ -296,7 +296,7 @@ def changed_by(env: gym.Env[Any, Any]) -> str | None:
     while isinstance(env, gym.Wrapper):
         neutral = next((kind for kind in NEUTRAL if isinstance(env, kind)), None)
         own = [m for m in STEPPING if m in vars(env) or getattr(type(env), m) is not getattr(neutral, m, None)]
-        if own and not getattr(env, "model_holds", False):
+        if not all(_said(env, method) for method in own):
             return type(env).__name__
         env = env.env
     return overridden(env)
@@ -305,20 +305,38 @@ def changed_by(env: gym.Env[Any, Any]) -> str | None:
 def overridden(env: gym.Env[Any, Any]) -> str | None:
     """In words, which of the methods that the model of ``env`` describes was overridden; None where none was."""
     base = env.unwrapped
-    if getattr(base, "model_holds", False):
-        return None
     name = type(base).__name__
     for method in STEPPING:
+        if _said(base, method):
+            continue
         if method in getattr(base, "__dict__", {}):
             return f"{method} of this {name} was replaced"
         owners = [
             kind
             for kind in type(base).__mro__
-            if kind not in (gym.Env, object) and callable(one := vars(kind).get(method)) and not _abstract(one)
+            if kind not in (gym.Env, object) and (one := vars(kind).get(method)) is not None and not _abstract(one)
         ]
+        if owners and not _defined_in(owners[0], method):
+            return f"{method} of {owners[0].__name__} was replaced"
         if len(owners) > 1 and not (_home(owners[0]) == _home(owners[1]) and _home(owners[0]) in OWN_PACKAGES):
             return f"{owners[0].__name__} overrides {method} of {owners[1].__name__}"
     return None
+
+
+def _said(one: object, method: str) -> bool:
+    """Whether ``model_holds`` is true of ``one``, or of the class that has its ``method`` or one derived from that."""
+    if getattr(one, "__dict__", {}).get("model_holds", False):
+        return True
+    order = type(one).__mro__
+    owner = next((i for i, kind in enumerate(order) if method in vars(kind)), len(order))
+    return any(vars(kind).get("model_holds", False) for kind in order[: owner + 1])
+
+
+def _defined_in(kind: type, method: str) -> bool:
+    """Whether ``method`` is a function written in the body of ``kind``."""
+    one = vars(kind)[method]
+    one = getattr(one, "__wrapped__", one)
+    return getattr(one, "__qualname__", "").split(".")[-2:-1] == [kind.__qualname__.split(".")[-1]]
 
 
 def _abstract(method: object) -> bool:

@@ -182,7 +182,7 @@ def make_world(
         try:
             mdp = tabular_mdp(env, on_end, allowed=allowed, end_reward=end_reward, failures=rule_of_ends)
         except InputError as error:
-            if on_end == "absorb" or end_reward:
+            if on_end == "absorb" or end_reward or masking:
                 raise error.within("env") from error
             note(f"learning from env.step, for {error}")
     for message in sorted({str(warning.message) for warning in caught}):

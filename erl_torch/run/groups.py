@@ -129,7 +129,8 @@ class Record:
 
     def content(self) -> tuple[Any, ...]:
         """What a checkpoint keeps."""
-        return self.prior, self.steps, *({k: np.stack(v) for k, v in x.items()} for x in (self.rows, self.alive))
+        steps = {name: list(steps) for name, steps in self.steps.items()}  # a copy: it goes on
+        return dict(self.prior), steps, *({k: np.stack(v) for k, v in x.items()} for x in (self.rows, self.alive))
 
     def lengths(self) -> dict[str, int]:
         """Records so far, by quantity."""

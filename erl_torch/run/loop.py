@@ -173,7 +173,11 @@ class Run(Generic[S, E, A]):
                 if isinstance(outcome.stopped, Exception) or recorder.failed(solution) is not None:
                     board.failed()
         assert solution is not None
-        result = self._written(outcome, solution, ended, notes, began)
+        try:
+            result = self._written(outcome, solution, ended, notes, began)
+        except BaseException:
+            self._keep(outcome, ended, lambda: learnt)
+            raise
         if outcome.stopped is not None:
             raise outcome.stopped
         saved.clear()

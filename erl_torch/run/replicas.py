@@ -176,6 +176,9 @@ class ReplicaRecorder:
 
     def finish(self, outcome: Outcome[ReplicaState], solution: ReplicaSolution, board: Board) -> ReplicaSolution:
         step = outcome.state.n_tuples
+        if self.judges.plays and self.recorded.steps.get("return", [step])[-1] != step:
+            alive = np.array([r not in outcome.state.failures for r in range(len(self.replicas))])
+            self.recorded.add(step, self.judges(outcome.state.policy.numpy(), True), board, alive)
         per_setting = " of each setting" if len(self.groups) > 1 else ""
         title = f"{self.title.env}, {self.title.learner}: {plural(self._n_each, 'replica')}{per_setting}"
         drawn = [("bands", self.recorded.curves(), "tuples streamed, each replica", title)]
@@ -333,6 +336,11 @@ class Judges:
         self.rngs = [streams(seed).evaluation for seed in seeds]
         self.model = judging_model(problem, settings)
         self.episode = None if self.model is None else episode_model(problem)
+
+    @property
+    def plays(self) -> bool:
+        """Whether figures come from episodes that are played, at milestones and at the end."""
+        return self.episode is None and self.problem.env is not None
 
     def generators(self) -> list[Any]:
         """States of the generators that play episodes."""

@@ -149,8 +149,11 @@ class Rows:
             if len(batch["s"]):
                 yield batch
         self.seen.bad += self._source.invalid
+        if self._source.invalid and self._of_next_row:
+            allowed = "mended: without s_next, the row before such a one would lead to the row after it"
+            raise InputError(f"path={self.path}", f"{self._source.invalid} lines that are no rows", allowed)
         if self._source.invalid and not self.seen.first_bad:
-            self.seen.first_bad = "a row with another number of columns"
+            self.seen.first_bad = "a line that is no row"
         self.short = self.seen.bad
 
     def _as_they_are(self, rows: int, strict: bool) -> Iterator[Batch]:

@@ -248,7 +248,7 @@ class JsonFile(InOrder):
     def __init__(self, path: str, file: Path) -> None:
         self.path, self._open = path, PACKED.get(file.suffix.lower(), open)
         found: dict[str, None] = {}
-        for one in self._lines(True):
+        for one in self._lines(False):
             found |= dict.fromkeys(one)
         self.names = list(found)
 
@@ -431,7 +431,8 @@ def _of_array(column: np.ndarray) -> Cells:
         return Cells(column)
     if column.ndim == 1 and column.dtype.kind in "US":
         distinct, codes = np.unique(column, return_inverse=True)
-        return Cells([x.decode() if isinstance(x, bytes) else x for x in distinct.tolist()], codes.astype(np.int64))
+        texts = [x.decode(errors="backslashreplace") if isinstance(x, bytes) else x for x in distinct.tolist()]
+        return Cells(texts, codes.astype(np.int64))
     if column.dtype.kind in "mM":
         return _of_array(column.astype(str))
     return _of_objects(column.tolist())
