@@ -1045,3 +1045,12 @@ def test_a_class_that_was_patched_is_not_believed(monkeypatch):
     monkeypatch.setattr(FrozenLakeEnv, "step", paying)
     with pytest.raises(InputError, match="step of FrozenLakeEnv was replaced"):
         erl_torch.tabular_mdp(FrozenLakeEnv())
+
+
+def test_a_table_that_leaves_a_part_out_is_learnt_from_steps(tmp_path):
+    """Taxi with a fickle passenger; the question how its episodes end was an error."""
+    cfg = composed(
+        "env=gym", "env.id=Taxi-v4", "++env.kwargs.fickle_passenger=true", "learner=certainty_equivalence",
+        "experience.n_episodes=2", "experience.episode_length=50", "evaluation.n_episodes=1", "evaluation.pictures=false",
+    )  # fmt: skip
+    assert train(cfg, tmp_path)["n_experience"] > 0
