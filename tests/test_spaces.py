@@ -1051,6 +1051,7 @@ def test_a_table_that_leaves_a_part_out_is_learnt_from_steps(tmp_path):
     """Taxi with a fickle passenger; the question how its episodes end was an error."""
     cfg = composed(
         "env=gym", "env.id=Taxi-v4", "++env.kwargs.fickle_passenger=true", "learner=certainty_equivalence",
-        "experience.n_episodes=2", "experience.episode_length=50", "evaluation.n_episodes=1", "evaluation.pictures=false",
+        "experience.n_episodes=2", "experience.episode_length=50", "evaluation.n_episodes=1",
+        "evaluation.pictures=false",
     )  # fmt: skip
     assert train(cfg, tmp_path)["n_experience"] > 0
