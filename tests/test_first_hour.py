@@ -19,12 +19,13 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hypothesis import given
 from hypothesis import strategies as st
 
-from erl_torch import Solution, Status, TabularMDP, compiled, pictures, solve_soft_bellman
+from erl_torch import InputError, Solution, Status, TabularMDP, compiled, pictures, solve_soft_bellman
 from erl_torch.cli import main as cli
 from erl_torch.cli import paths, sweeps
 from erl_torch.cli.typed import Typed
 from erl_torch.empirical.uncertainty import Estimate
 from erl_torch.guesses import guess
+from erl_torch.run.classes import resolve
 from erl_torch.run.verdict import verdict
 
 QUICK = ("learner=certainty_equivalence", "experience.n_episodes=2", "evaluation.pictures=false")
@@ -446,3 +447,10 @@ def test_captions_name_what_is_drawn(monkeypatch, known, markers):
     line = pictures.BandLine("x", [1, 2], [found] * 2, [1.0 if known else None] * 2)
     pictures.bands({"theta": [line]}, "beta", "title", markers)
     assert ("exact" in captions[0]) == known
+
+
+@pytest.mark.parametrize("group", ["experience", "env"])
+def test_a_file_is_an_experience_path(tmp_path, group):
+    (tmp_path / "log.csv").write_text("s,a,r,s_next\n0,0,1,0\n")
+    with pytest.raises(InputError, match=r"experience=recorded experience.path=.*log\.csv"):
+        resolve(f"{tmp_path}/log.csv", f"{group}.class")

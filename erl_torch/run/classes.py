@@ -11,6 +11,7 @@ import os
 import traceback
 from collections.abc import Mapping
 from dataclasses import MISSING, fields, is_dataclass
+from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeGuard
 
@@ -47,6 +48,8 @@ def resolve(path: object, key: str) -> type:
     allowed = "the dotted name of a class, as in my_package.MyClass"
     if not module:
         raise InputError(key, path, allowed)
+    if key in ("experience.class", "env.class") and Path(str(path)).exists():
+        raise InputError(key.split(".")[0], path, f"left out for a file: experience=recorded experience.path={path}")
     home = imported(module, key, path, allowed)
     if not isinstance(found := getattr(home, name, None), type):
         classes = [one for one, value in vars(home).items() if isinstance(value, type)]
