@@ -328,3 +328,13 @@ def test_a_run_from_steps_learns_of_the_charge(tmp_path):
 def test_bad_keys_are_named(overrides, text, tmp_path):
     with pytest.raises(InputError, match=text):
         train(composed(*overrides, *FEW), tmp_path)
+
+
+def test_a_preset_says_which_learner_it_wants(tmp_path):
+    """As typed, CartPole-v1 was learnt worse than the prior, with no word of what to do."""
+    few = ("experience.n_episodes=3", "experience.episode_length=20", "evaluation.n_episodes=1")
+    wanted = "wants learner=s1_efficient"
+    for learner, says in (("s1", True), ("s1_efficient", False)):
+        short = ("learner.n_epochs=1", "learner.n_bias=1") if learner == "s1" else ()
+        result = train(composed("env=cart_pole_v1", f"learner={learner}", *few, *short), tmp_path / learner)
+        assert any(wanted in text for text in result["notes"]) == says

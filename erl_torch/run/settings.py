@@ -25,6 +25,7 @@ class Suggest:
     lr_rho: float | None = None
     n_episodes: int = 500
     episode_length: int = 1000
+    learner: str | None = None  # that published S1 should give way to
 
 
 @dataclass

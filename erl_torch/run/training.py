@@ -102,6 +102,9 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
         if cfg[key] and not many:
             raise InputError(key, cfg[key], "left out, or used with n_replicas > 1 or vary.KEY=[...]")
     with collected() as notes, contextlib.ExitStack() as stack:
+        suited = cfg.env.get("suggest", {}).get("learner")
+        if suited is not None and cfg.learner.name == "s1":
+            note(f"{cfg.env.name} wants learner={suited}: published S1 does not learn it (docs/environments.md)")
         log: Log | None = None
         if is_log(cfg.env):
             log, learner = make_log(cfg, safe_point)
