@@ -461,7 +461,11 @@ def test_types_are_judged_by_the_column_not_its_first_batch(tmp_path):
         ("lost.csv", b"s,a,r,done\nx,0,1,0\n,0,1,1\n", r"s\[1\]=missing: must be one of x"),
         ("down.csv", b"episode,t,s,a,r\n1,3,0,0,1\n1,2,1,0,1\n1,1,0,0,1\n", "t=steps of -1: must be in order of time"),
         ("latin.csv", "s,a,r,done\né,0,1,1\n".encode("latin-1"), "must be a readable CSV file"),
-        ("cut.csv.gz", gzip.compress(b"s,a,r,done\n" + b"0,0,1,1\n" * 9000)[:40], "must be a readable CSV file"),
+        (
+            "cut.csv.gz",
+            gzip.compress(b"s,a,r,done\n" + b"0,0,1,1\n" * 9000, mtime=0)[:40],
+            "must be a readable CSV file",
+        ),
         ("none.csv.gz", b"s,a,r,done\n0,0,1,1\n", "must be a readable CSV file"),
         ("text.jsonl", b'{"s":0,"a":0,"r":1,"done":true}\nnothing\n', "line 2=nothing: must be a JSON object"),
         ("list.jsonl", b"[1,2]\n", r"line 1=\[1,2\]: must be a JSON object"),
