@@ -486,13 +486,13 @@ def test_one_line_for_what_cannot_be_read(tmp_path, name, content, said):
 
 def test_bad_rows_are_left_out_and_counted(tmp_path):
     path = tmp_path / "t.csv"
-    path.write_text("episode,s,a,r\n1,x,0,1\n1,y,0,\n1,,0,2\n1,x,1\n1,x,1,3\n1,y,0,4\n1,x,0,5\n")
+    path.write_text("episode,s,a,r\n1,x,0,1\n1,y,0,\n1,,0,2\n1,x,1,3\n1,y,0,4\n1,x,0,5\n")
     log = read_log(path, on_bad="skip")
-    # The row before the one whose state is missing has no state after; of a row of three columns nothing is known.
+    # The row before the one whose state is missing has no state after.
     assert named(log) == [("x", "0", 1.0, "y"), ("x", "1", 3.0, "y"), ("y", "0", 4.0, "x")]
-    assert (log.report.bad, log.report.last) == (3, 1)
+    assert (log.report.bad, log.report.last) == (2, 1)
     assert log.report.first_bad == "r[1]=missing"
-    assert log.recording.n_skipped == 3
+    assert log.recording.n_skipped == 2
 
 
 def test_other_refusals(tmp_path):

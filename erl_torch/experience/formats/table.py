@@ -250,6 +250,9 @@ class JsonFile(InOrder):
         found: dict[str, None] = {}
         for one in self._lines(False):
             found |= dict.fromkeys(one)
+        if not found:  # then the first line that is none is what is wrong
+            for _ in self._lines(True):
+                pass
         self.names = list(found)
 
     def _lines(self, strict: bool) -> Iterator[dict[str, Any]]:
