@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import numbers
 import os
+import re
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import fields
@@ -50,7 +51,7 @@ class InputError(ValueError):
 
     def within(self, group: str) -> InputError:
         """The same error with ``group.`` before the key; a key that names a place ("ENV, step 3: ...") stays."""
-        if ", " in self.key:
+        if re.search(r", (step \d+|reset)\b", self.key):
             return self
         return InputError(f"{group}.{self.key}", self.value, self.allowed)
 

@@ -262,7 +262,7 @@ def test_rows_of_single_precision_are_welcome_and_named():
     with pytest.warns(Note):
         scaled = TabularMDP([[[1.0], [2.0]]], [[0.0, 0.0]], normalise=True)
     np.testing.assert_array_equal(scaled.transition.toarray(), 1.0)
-    with pytest.raises(InputError, match="of a finite sum > 0"):
+    with pytest.raises(InputError, match="sum 0: must be a distribution"):
         TabularMDP([[[1.0], [0.0]]], [[0.0, 0.0]], normalise=True)
 
 
