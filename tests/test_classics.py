@@ -340,7 +340,7 @@ def test_rewards_of_prism_are_those_of_the_model(tmp_path, srew, trew, said):
     "make",
     [
         lambda: TabularMDP.from_outcomes(2, 2, None),
-        lambda: TabularMDP.from_outcomes(2, 2, lambda s, a: 3),
+        lambda: TabularMDP.from_outcomes(2, 2, lambda s, a: 3),  # type: ignore[return-value]
         lambda: TabularMDP.from_outcomes(10**6, 10**6, lambda s, a: []),
         lambda: TabularMDP.from_pairs([0, 1], [0, 2 * 10**9], np.eye(2), [1, 2]),
         lambda: TabularMDP.from_pairs([0, 1], np.array([0, 2**63], np.uint64), np.eye(2), [1, 2]),

@@ -990,7 +990,12 @@ def test_the_environment_of_the_command_line_is_encoded():
 @pytest.mark.parametrize("part", ["observation", "reward", "info"])
 def test_a_vector_hands_on_what_is_wrong_in_one_line(part):
     """What one of its environments returned ended in NumPy's own words."""
-    wrong = {"observation": [0.5, None, "s", [1]], "reward": [10**400, None], "info": [None, [], "x"]}[part]
+    values: dict[str, list[Any]] = {
+        "observation": [0.5, None, "s", [1]],
+        "reward": [10**400, None],
+        "info": [None, [], "x"],
+    }
+    wrong = values[part]
 
     class Odd(gym.Env):
         observation_space, action_space, value = gym.spaces.Discrete(3), gym.spaces.Discrete(2), None

@@ -149,13 +149,13 @@ def _object(key: str, value: object, depth: int) -> Any:
         return {"class": _name(type(value)), "of": plain(key, wrapped, depth)}
     try:
         reduce = copyreg.dispatch_table.get(type(value))
-        parts: Any = value.__reduce_ex__(2) if reduce is None else reduce(value)  # what a copy would be made of
+        made: Any = value.__reduce_ex__(2) if reduce is None else reduce(value)  # what a copy would be made of
     except Exception as error:  # of a lock, a file, and the like
         allowed = "a value that can be told from others: numbers, text, arrays, containers, dataclasses, functions"
         raise InputError(key, f"of class {_name(type(value))}", f"{allowed} ({error})") from error
-    if isinstance(parts, str):
-        return f"{_name(type(value))} {parts}"
-    told = [plain(key, list(part) if isinstance(part, Iterator) else part, depth) for part in parts]
+    if isinstance(made, str):
+        return f"{_name(type(value))} {made}"
+    told = [plain(key, list(part) if isinstance(part, Iterator) else part, depth) for part in made]
     return {"class": _name(type(value)), "parts": told}
 
 
