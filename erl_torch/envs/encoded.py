@@ -9,7 +9,7 @@ of the actions that may be taken: it goes to ``info["action_mask"]``.
 
 from __future__ import annotations
 
-from typing import Any, TypeVar, overload
+from typing import TYPE_CHECKING, Any, TypeVar, overload
 
 import gymnasium as gym
 import numpy as np
@@ -22,6 +22,12 @@ from erl_torch.labels import Labels
 from erl_torch.mdp.from_gymnasium import MASKED, space_labels
 
 Other = TypeVar("Other")
+
+
+if TYPE_CHECKING:
+    VectorBase = gym.vector.VectorWrapper[Any, Any, Any, Any, Any]
+else:
+    VectorBase = gym.vector.VectorWrapper  # Gymnasium 1.3 does not know it as generic
 
 
 class Encoded(gym.Wrapper[np.int64, np.int64, Any, Any], gym.utils.RecordConstructorArgs):
@@ -64,7 +70,7 @@ class Encoded(gym.Wrapper[np.int64, np.int64, Any, Any], gym.utils.RecordConstru
         return np.int64(self.state_labels.encode(observation, "observation")), info
 
 
-class EncodedVector(gym.vector.VectorWrapper[Any, Any, Any, Any, Any]):
+class EncodedVector(VectorBase):
     """A vector of environments with finite spaces, as Discrete and Discrete; else as ``Encoded``."""
 
     def __init__(self, env: gym.vector.VectorEnv[Any, Any, Any]) -> None:
