@@ -32,7 +32,7 @@ from erl_torch.experience.recording import CHUNK, READ, FileRecording, Recordabl
 from erl_torch.experience.transitions import COLUMNS, Transitions
 from erl_torch.labels import Labels
 from erl_torch.mdp.ends import RULES, EndRule, Failures
-from erl_torch.mdp.tabular import check_policy
+from erl_torch.mdp.tabular import check_policy, uniform
 from erl_torch.problem import Problem
 
 UNSEEN = ("missing", "allowed")  # pairs that no row shows
@@ -250,7 +250,7 @@ def prior_of(visits: np.ndarray, unseen_actions: str) -> np.ndarray:
     """
     has = visits > 0 if unseen_actions == "missing" else np.ones_like(visits, bool)
     has = has | ~has.any(1, keepdims=True)
-    return np.asarray(has / has.sum(1, keepdims=True))
+    return uniform(has)
 
 
 # -- where the rows are ------------------------------------------------------------------------------------

@@ -8,6 +8,7 @@ is drawn from the prior, with the stream "behaviour" of the seed, one number per
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
 from typing import Any, Protocol
 
@@ -64,23 +65,26 @@ class Minari:
             env = env.env
         self._bins = env if isinstance(env, Discretise) else None
 
-    def batches(self, rows: int, strict: bool) -> Iterator[Batch]:
+    def episodes(self) -> Iterator[tuple[Batch, bool]]:
+        """(s, a, r, s' of an episode, whether it terminated), one after the other. Raises InputError."""
         minari = plugin("minari", self.path, "minari")
         with readable(self.path, "Minari data set on this machine"):
             data = minari.load_dataset(self.path.removeprefix(PREFIX))
             episodes = iter(data.iterate_episodes())
-        held: list[tuple[Batch, np.ndarray, bool]] = []  # with one number per tuple, and whether it terminated
-        rng = streams(self._seed).behaviour
-        first: tuple[int, int] | None = None
-        number = 0
-        ready: list[Batch] = []
-        while True:
+        for number in itertools.count():
             with readable(self.path, f"Minari data set (from episode {number} on)"):
                 episode = next(episodes, None)
                 if episode is None:
-                    break
-                batch, terminated = self._tuples(episode, number, data)
-            number += 1
+                    return
+                found = self._tuples(episode, number, data)
+            yield found
+
+    def batches(self, rows: int, strict: bool) -> Iterator[Batch]:
+        held: list[tuple[Batch, np.ndarray, bool]] = []  # with one number per tuple, and whether it terminated
+        rng = streams(self._seed).behaviour
+        first: tuple[int, int] | None = None
+        ready: list[Batch] = []
+        for batch, terminated in self.episodes():
             if not len(batch["s"]):
                 continue
             begins = int(batch["s"][0]), int(batch["a"][0])
@@ -150,26 +154,15 @@ class Episodes(InOrder):
 
     def __init__(self, path: str) -> None:
         self.path = path
-        self._tuples = Minari(path, Options(1, 1))._tuples
+        self._episodes = Minari(path, Options(1, 1)).episodes
 
     def batches(self, names: Sequence[str], rows: int, strict: bool) -> Iterator[dict[str, Cells]]:
-        minari = plugin("minari", self.path, "minari")
-        with readable(self.path, "Minari data set on this machine"):
-            data = minari.load_dataset(self.path.removeprefix(PREFIX))
-            episodes = iter(data.iterate_episodes())
         held: list[Batch] = []
-        number = 0
-        while True:
-            with readable(self.path, f"Minari data set (from episode {number} on)"):
-                episode = next(episodes, None)
-                if episode is None:
-                    break
-                batch, terminated = self._tuples(episode, number, data)
+        for number, (batch, terminated) in enumerate(self._episodes()):
             n = len(batch["s"])
             last = np.arange(n) == n - 1
             flags = {"terminated": last & terminated, "truncated": last & (not terminated)}
             held.append({**batch, **flags, "episode": np.full(n, number, np.int64)})
-            number += 1
             if sum(len(one["s"]) for one in held) >= rows:
                 yield from _as_cells(held, names, rows)
                 held = []
