@@ -1021,3 +1021,17 @@ def test_replicas_that_play_are_judged_at_their_end(tmp_path, monkeypatch):
         )
     arrays = np.load(tmp_path / "replicas.npz")
     assert arrays["record_step/objective"][-1] == arrays["record_step/theta"][-1] > 0
+
+
+def test_a_replica_whose_theta_is_lost_has_failed(tmp_path, tuples):
+    """Alone it is NON_FINITE; as a replica it was "completed", with NaN in its file."""
+
+    class Lost(AlgorithmS1):
+        def step(self, state, stream):
+            after = super().step(state, stream)
+            return dataclasses.replace(after, rho=float("nan")) if after.n_tuples > 2 * len(tuples) else after
+
+    for name, learner in (("one", Lost()), ("many", Replicas.of(Lost(), 2))):
+        with pytest.raises(NonFiniteError, match="theta is nan"):
+            erl_torch.train(learner, MDP, tuples, directory=tmp_path / name, evaluation=QUICK)
+    assert np.isfinite(np.load(tmp_path / "many/replicas.npz")["theta"]).all()

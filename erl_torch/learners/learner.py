@@ -308,6 +308,14 @@ def _of_prior(learner: Any, prior: np.ndarray) -> Any:
     return replace(learner, prior_policy=prior)
 
 
+def check_numbers(position: int, theta: float | None, policy: Policy | None = None) -> None:
+    """Raise NonFiniteError where theta or the policy (None: not looked at) of one learner is no longer of numbers."""
+    if theta is not None and not np.isfinite(theta):
+        raise NonFiniteError(position, f"theta is {theta}")
+    if policy is not None and not torch.isfinite(policy).all():
+        raise NonFiniteError(position, "the policy has probabilities that are no numbers")
+
+
 def message(failure: BaseException | None) -> str:
     """What a solution says of ``failure``: a run that was stopped has nothing to say."""
     return str(failure) if isinstance(failure, NonFiniteError) else ""

@@ -36,7 +36,7 @@ from erl_torch.experience.experience import permitted
 from erl_torch.experience.simulation import ReplicaExperience, Simulation, fits, longest, streams_of, tuples_of
 from erl_torch.experience.transitions import Transitions
 from erl_torch.files import read_npz, write_npz
-from erl_torch.learners.learner import NonFiniteError, StreamLearner, StreamState, columns, with_prior
+from erl_torch.learners.learner import NonFiniteError, StreamLearner, StreamState, check_numbers, columns, with_prior
 from erl_torch.learners.s1.algorithm import AlgorithmS1
 from erl_torch.learners.s1.lanes import LanesState, can_interleave, interleave
 from erl_torch.learners.together import Together, check_learner
@@ -360,8 +360,7 @@ def each(
                 stream = learners[r].prepare(tuples_of(experience, r, prior), n_states, n_actions)
                 held[r] = stream if hold else None
             after: StreamState = learners[r].step(states[r], stream)
-            if not torch.isfinite(after.policy).all():
-                raise NonFiniteError(after.n_tuples, "the policy has probabilities that are no numbers")
+            check_numbers(after.n_tuples, after.theta, after.policy)
             return after
         except NonFiniteError as error:
             return error

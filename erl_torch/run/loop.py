@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from erl_torch.checks import InputError
 from erl_torch.files import write_json
-from erl_torch.learners.learner import Learner, NonFiniteError, State, columns
+from erl_torch.learners.learner import Learner, NonFiniteError, State, check_numbers, columns
 from erl_torch.log.event_file import PATTERN
 from erl_torch.log.tensorboard import Board, Boards, of_sweep
 from erl_torch.notes import note
@@ -227,7 +227,8 @@ class Run(Generic[S, E, A]):
                 states = learner.run(self.problem, self.experience, outcome.state if goes_on else None)
                 for state in _timed(states, outcome):
                     row = _checked(state.metrics(), outcome.history, recorder.shape)
-                    _check_theta(row, learner.position(state))
+                    if not recorder.shape:
+                        check_numbers(learner.position(state), row.get("theta"))
                     outcome.state = state
                     outcome.history.append(row)
                     milestone = learner.milestone(state)
@@ -307,12 +308,6 @@ def _finite(value: Any) -> Any:  # what JSON holds
     if isinstance(value, (list, tuple)):
         return [_finite(item) for item in value]
     return None if isinstance(value, float) and not np.isfinite(value) else value
-
-
-def _check_theta(row: Row, position: int) -> None:
-    """Raise NonFiniteError for the theta of one learner that is no longer a number."""
-    if np.ndim(row.get("theta", 0.0)) == 0 and not np.isfinite(row.get("theta", 0.0)):
-        raise NonFiniteError(position, f"theta is {row['theta']}")
 
 
 def _timed(states: Iterator[S], outcome: Outcome[S]) -> Iterator[S]:

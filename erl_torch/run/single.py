@@ -23,7 +23,7 @@ from erl_torch.evaluation import Evaluation, evaluate
 from erl_torch.experience.experience import Experience
 from erl_torch.experience.log import Log
 from erl_torch.files import write_bytes
-from erl_torch.learners.learner import NonFiniteError, TabularLearner, TabularState
+from erl_torch.learners.learner import NonFiniteError, TabularLearner, TabularState, check_numbers
 from erl_torch.log.quantities import QUANTITIES, results, tagged, with_own
 from erl_torch.log.tensorboard import Board, Boards, layout
 from erl_torch.notes import note
@@ -181,8 +181,7 @@ class SingleRecorder:
         if not isinstance(policy, torch.Tensor) or policy.shape != self.problem.prior.shape:
             shape = list(self.problem.prior.shape)
             raise InputError("policy of the learner", type(policy).__name__, f"a torch.Tensor {shape}, in every epoch")
-        if not torch.isfinite(policy).all():
-            raise NonFiniteError(position, "the policy has probabilities that are no numbers")
+        check_numbers(position, None, policy)
         self.last = self._measure(policy)
         board.record(self._tags(state, position, row), position)
         if milestone:
