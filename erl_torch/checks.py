@@ -93,6 +93,16 @@ def temperature(key: str, value: object) -> float:
     return number(key, beta, lambda x: SMALLEST_BETA <= x <= LARGEST_BETA, f"in [{SMALLEST_BETA:g}, {LARGEST_BETA:g}]")
 
 
+def optimism(key: str, value: object, beta: float) -> float:
+    """``value`` as a float. Raises InputError unless it is a finite number whose product with ``beta`` is 0 or leaves
+    products in double precision."""
+    optimism = finite(key, value)
+    kappa = abs(optimism * beta)
+    if optimism and not SMALLEST_BETA <= kappa <= LARGEST_BETA:
+        raise InputError(key, value, f"0, or such that |optimism * beta| is in [{SMALLEST_BETA:g}, {LARGEST_BETA:g}]")
+    return optimism
+
+
 def step_size(key: str, value: object) -> float:
     """``value`` as a float. Raises InputError unless it lies in (0, 1]."""
     return number(key, value, lambda x: 0 < x <= 1, "a number in (0, 1]")

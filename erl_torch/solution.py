@@ -35,6 +35,9 @@ class Status(enum.Enum):
         "Raise tol or lower beta"
     )
     REDUCIBLE = "the states that the start leads to are not one recurrent class; the message names them"
+    NO_SINGLE_RATE = (
+        "no single rate was found for all starts, as may happen below optimism 0; the bounds hold for every start"
+    )
     ILL_POSED = "a way round that never ends pays more than ending; the message names it"
     STOPPED = "stopped by the caller before the last pass; the tables are those of the last full epoch"
     PSI_LIMIT = "the psi phase met max_psi_epochs before psi_tol: raise max_psi_epochs or lr_psi"
@@ -69,13 +72,14 @@ class Solution:
     psi: torch.Tensor  # [S] > 0, 1 / sum_a prior(a|s) u(s,a); likewise, ``log_psi``
     rho: float | None = None
     theta: float | None = None  # reward per step; -theta is the regularised reward rate
-    reward_bias: torch.Tensor  # [S, A] >= 0, reward per step
+    reward_bias: torch.Tensor  # [S, A] >= 0, reward per step; <= 0 above optimism 1
     reward_bias_max: float
     n_steps: int  # tuples that the u updates used, all epochs together
     status: Status
     message: str = ""  # where and why, if the run failed
     history: Mapping[str, np.ndarray] = field(default_factory=dict)
     beta: float | None = None
+    optimism: float = 0.0  # 1 optimistic (control as inference), 0 right, negative robust
     value: torch.Tensor | None = None  # V(s), [S], reward, up to a constant; exact solvers
     action_value: torch.Tensor | None = None  # Q(s,a), [S, A], with the same constant
     theta_bounds: tuple[float, float] | None = None  # two-sided, on theta*; where the model is known
@@ -239,9 +243,9 @@ def _readers() -> dict[str, Callable[[str, np.ndarray], Any]]:
     not_negative = number(lambda x: x >= 0, "a number >= 0")
     return {
         "policy": policy, "u": pair, "psi": state, "reward_bias": pair, "value": state, "action_value": pair,
-        "rho": not_negative, "theta": finite, "reward_bias_max": not_negative, "gap": not_negative,
+        "rho": not_negative, "theta": finite, "reward_bias_max": finite, "gap": not_negative,
         "beta": number(lambda x: 0 < x < math.inf, "a finite number > 0"), "n_steps": count, "k": count,
-        "status": status, "message": message, "theta_bounds": bounds,
+        "optimism": finite, "status": status, "message": message, "theta_bounds": bounds,
         "state_labels": labels, "action_labels": labels,
     }  # fmt: skip
 

@@ -402,7 +402,7 @@ def test_solutions_come_back_as_they_were(tmp_path, solution):
         ("rho", -1.0, r"rho=-1\.0: must be a number >= 0"),
         ("beta", np.nan, "beta=nan: must be a finite number > 0"),
         ("gap", np.nan, "gap=nan: must be a number >= 0"),
-        ("reward_bias_max", np.nan, "reward_bias_max=nan: must be a number >= 0"),
+        ("reward_bias_max", np.nan, "reward_bias_max=nan: must be a finite number"),
         ("n_steps", 1.5, r"n_steps=1\.5: must be a whole number >= 0"),
         ("k", -1, "k=-1: must be a whole number >= 0"),
         ("status", "FOO", "status=FOO: must be COMPLETED or"),

@@ -53,6 +53,7 @@ WORST_FIRST = (
     Status.NON_FINITE,
     Status.STOPPED,
     Status.ILL_POSED,
+    Status.NO_SINGLE_RATE,
     Status.PSI_LIMIT,
     Status.STEP_LIMIT,
     Status.STAGNATED,

@@ -11,7 +11,7 @@ takes it has KL infinite. Its row is empty and its reward 0 here, so that it is 
 from __future__ import annotations
 
 import contextlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -35,13 +35,17 @@ class BellmanProblem:
     prior: np.ndarray  # [n, A]; 0 where the state does not have the action
     start: np.ndarray  # [n]
     beta: float
+    optimism: float = 0.0  # 1 optimistic, 0 right, negative robust: what is made of the dice of the dynamics
 
     @classmethod
-    def of(cls, mdp: TabularMDP, beta: float, prior_policy: ArrayLike | None = None) -> BellmanProblem:
-        """Restrict ``mdp``, also to the pairs with prior > 0. Raises InputError for beta <= 0, or a prior that is not
-        one of the actions that ``mdp`` has."""
+    def of(
+        cls, mdp: TabularMDP, beta: float, prior_policy: ArrayLike | None = None, optimism: float = 0.0
+    ) -> BellmanProblem:
+        """Restrict ``mdp``, also to the pairs with prior > 0. Raises InputError for beta <= 0, optimism that is no
+        finite number, or a prior that is not one of the actions that ``mdp`` has."""
         checks.instance("mdp", mdp, TabularMDP, "a TabularMDP")
         beta = checks.temperature("beta", beta)
+        optimism = checks.optimism("optimism", optimism, beta)
         prior = check_prior("prior_policy", prior_policy, mdp.n_states, mdp.n_actions, mdp.allowed)
         mdp = mdp.restricted(prior > 0)
         p, n_actions = mdp.transition, mdp.n_actions
@@ -50,7 +54,12 @@ class BellmanProblem:
         if not mask.all():
             rows = (states[:, None] * n_actions + np.arange(n_actions)).ravel()
             p = sp.csr_array(p[rows][:, states])
-        return cls(states, p, mdp.reward[mask], prior[mask], mdp.start[mask], beta)
+        return cls(states, p, mdp.reward[mask], prior[mask], mdp.start[mask], beta, optimism)
+
+    @property
+    def kappa(self) -> float:
+        """optimism * beta, 1/reward: the coefficient of the certainty equivalent of V(s')."""
+        return self.optimism * self.beta
 
     @property
     def n_states(self) -> int:
@@ -150,7 +159,14 @@ class BellmanProblem:
         rows = (members[:, None] * self.n_actions + np.arange(self.n_actions)).ravel()
         p = sp.csr_array(self.transition[rows][:, members])
         start = np.full(len(members), 1.0 / len(members))
-        return BellmanProblem(self.states[members], p, self.reward[members], self.prior[members], start, self.beta)
+        return replace(
+            self,
+            states=self.states[members],
+            transition=p,
+            reward=self.reward[members],
+            prior=self.prior[members],
+            start=start,
+        )
 
     def regeneration_state(self) -> int | None:
         """The most likely first state in the only closed class; None where there are several classes."""
