@@ -189,3 +189,73 @@ class Oracle:
             if max(abs(x) for x in value) > mpf(10) ** 6:
                 break
         return Answer(low, high, value, False)
+
+    # -- the game, for optimism < 0
+
+    def game(self) -> tuple[mpf, mpf]:
+        """(what the agent can secure, what nature can hold it to), of the game behind optimism < 0: g* is in between.
+
+        Policy iteration for each side against the other's fixed reply. It knows distributions, what nature pays for
+        them, KL(q || p)/|kappa|, and the linear equations of (pi, q), but no certainty equivalent.
+        """
+        self._at(DIGITS[0])
+        policy, q = self.prior, self.p
+        secured = -mp.inf
+        for _ in range(STEPS):
+            least = mp.inf
+            for _ in range(STEPS):
+                g, value = self._rate(policy, q)
+                q = self._reply(value)
+                if least - g <= SHARP:
+                    break
+                least = g
+            if least - secured <= SHARP:
+                break
+            secured = least
+            policy = self._best(q, value)
+        most = -mp.inf
+        for _ in range(STEPS):
+            g, value = self._rate(policy, q)
+            policy = self._best(q, value)
+            if g - most <= SHARP:
+                break
+            most = g
+        return secured, most
+
+    def _paid(self, q: list[list[Row]], s: int, a: int) -> mpf:
+        """r and what nature pays."""
+        kappa = mpf(self.optimism * self.given.beta)
+        surprise = mp.fsum(x * mp.log(x / self.p[s][a][t]) for t, x in q[s][a].items())
+        return self.reward[s][a] - surprise / kappa
+
+    def _rate(self, policy: list[list[mpf]], q: list[list[Row]]) -> tuple[mpf, dict[int, mpf]]:
+        rows: dict[int, Row] = {s: {} for s in range(self.n_states)}
+        reward = {}
+        for s in range(self.n_states):
+            steps = []
+            for a, (x, x0) in enumerate(zip(policy[s], self.prior[s], strict=True)):
+                steps.append(x * (self._paid(q, s, a) - mp.log(x / x0) / mpf(self.given.beta)))
+                for t, chance in q[s][a].items():
+                    if t != s:
+                        rows[s][t] = rows[s].get(t, mpf(0)) + x * chance
+            reward[s] = mp.fsum(steps)
+        return relative_value(rows, reward)
+
+    def _reply(self, value: dict[int, mpf]) -> list[list[Row]]:
+        """Nature's: argmin of q V + KL(q || p)/|kappa|."""
+        kappa = mpf(self.optimism * self.given.beta)
+        y = {t: mp.exp(kappa * x) for t, x in value.items()}
+        weights = [[{t: x * y[t] for t, x in row.items()} for row in rows] for rows in self.p]
+        return [[{t: x / mp.fsum(row.values()) for t, x in row.items()} for row in rows] for rows in weights]
+
+    def _best(self, q: list[list[Row]], value: dict[int, mpf]) -> list[list[mpf]]:
+        """The agent's policy against q."""
+        found = []
+        for s in range(self.n_states):
+            worth = [
+                self._paid(q, s, a) + mp.fsum(x * value[t] for t, x in q[s][a].items()) for a in range(self.n_actions)
+            ]
+            top = max(worth)
+            pi = [x * mp.exp(mpf(self.given.beta) * (w - top)) for x, w in zip(self.prior[s], worth, strict=True)]
+            found.append([x / mp.fsum(pi) for x in pi])
+        return found

@@ -29,6 +29,15 @@ def test_bounds_and_roots_in_many_digits(number):
             assert np.sign(1 - optimism) * (float(theta) - state.theta) >= -1e-9 * (1 + np.ptp(state.value))
 
 
+@pytest.mark.parametrize("number", [n for n in range(40) if OPTIMISMS[n % len(OPTIMISMS)] < 0])
+def test_the_game_has_that_value(number):
+    """Below optimism 0, what the agent can secure and what nature can hold it to meet where TV = V + g says."""
+    _, given, optimism, answer = many_digits(number)
+    secured, held = Oracle(given, optimism).game()
+    assert abs(secured - answer.low) < mpf(10) ** -20
+    assert abs(held - answer.high) < mpf(10) ** -20
+
+
 @pytest.mark.parametrize("optimism", [o for o in OPTIMISMS if abs(o) < 5])
 @pytest.mark.parametrize("seed", range(6))
 def test_iterations_are_the_dense_ones(seed, optimism):
