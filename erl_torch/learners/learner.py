@@ -133,6 +133,14 @@ class TabularLearner(Learner[S, Experience, Solution], Protocol[S]):
         """Inverse temperature, 1/reward."""
 
     @property
+    def optimism(self) -> float:
+        """Of the problem that it is held against: 1 optimistic (control as inference), 0 right, negative robust."""
+
+    @property
+    def reward_noise(self) -> str:
+        """How rewards that vary for the same (s,a) count in that problem: by their "mean", or "joint" with s'."""
+
+    @property
     def prior_policy(self) -> Table:
         """[S, A], 0 where a state does not have the action; None is uniform."""
 
@@ -170,6 +178,8 @@ class StreamLearner(ABC, Generic[T, Prepared]):
     stream_bytes: ClassVar[int] = 40  # memory of a tuple in ``prepare``d experience
 
     beta: float
+    optimism: float = 0.0
+    reward_noise: str = "mean"
     prior_policy: Table
 
     @property
