@@ -58,9 +58,7 @@ class EmpiricalMDP:
     def n_actions(self) -> int:
         return int(self.visits.shape[1])
 
-    def problem(
-        self, beta: float, prior_policy: ArrayLike | None = None, *, optimism: float = 0.0
-    ) -> EmpiricalProblem:
+    def problem(self, beta: float, prior_policy: ArrayLike | None = None, *, optimism: float = 0.0) -> EmpiricalProblem:
         """The empirical problem; the module's docstring says what is left out.
 
         ``optimism``: 1 optimistic (control as inference), 0 right, negative robust.

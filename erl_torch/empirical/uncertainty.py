@@ -288,7 +288,9 @@ def bootstrap_theta(
     withheld = plug_in.withheld
     if not withheld and error < LEAST_RESAMPLED * plug_in.standard_error:
         withheld = "the resamples vary less than the draws: pairs that matter were drawn too few times"
-    return Estimate("theta", plug_in.value + plug_in.bias, error, np.array(samples), withheld=withheld, warning=plug_in.warning)
+    return Estimate(
+        "theta", plug_in.value + plug_in.bias, error, np.array(samples), withheld=withheld, warning=plug_in.warning
+    )
 
 
 def _plug_in(

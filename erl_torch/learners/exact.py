@@ -79,6 +79,7 @@ class Exact:
     averages_exp_reward: ClassVar[bool] = False
     drawn_from_prior: ClassVar[str] = ""
     reward_noise: ClassVar[str] = "mean"
+    assumed_optimism: ClassVar[float | None] = None
 
     beta: float = 10.0
     optimism: float = 0.0

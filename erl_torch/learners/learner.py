@@ -149,6 +149,10 @@ class TabularLearner(Learner[S, Experience, Solution], Protocol[S]):
         """Whether noise in r counts as reward."""
 
     @property
+    def assumed_optimism(self) -> float | None:
+        """Of the dynamics, of a learner that has no choice in it, where that is not 0: of U-learning 1."""
+
+    @property
     def drawn_from_prior(self) -> str:
         """The column that must be draws from the prior policy: "a", "a_next" or ""."""
 
@@ -180,6 +184,7 @@ class StreamLearner(ABC, Generic[T, Prepared]):
     beta: float
     optimism: float = 0.0
     reward_noise: str = "mean"
+    assumed_optimism: ClassVar[float | None] = None
     prior_policy: Table
 
     @property
