@@ -36,10 +36,10 @@ interval, where there is none.
 A state that the data never show is no part of the problem (``erl_torch.empirical.counts``), nor of the error.
 
 Above optimism 0 and below, kappa = optimism * beta, J is the nested one (``erl_torch.solvers``), E V gives way to
-C V = (1/kappa) log E exp(kappa V(s')), d is of the process of pi and q = p exp(kappa (V(s') - C V)), and in place of V(s')
-stands xi = exp(kappa (V(s') - C V)) / kappa: Var_p(xi) = chi^2(q || p) / kappa^2. ``warning`` names a pair that matters
-where max q/p is above sqrt(n): what the data say of it rests on a handful of tuples. A successor that was never seen
-shows at no optimism.
+C V = (1/kappa) log E exp(kappa V(s')), d is of the process of pi and q = p exp(kappa (V(s') - C V)), and in place of
+V(s') stands xi = exp(kappa (V(s') - C V)) / kappa: Var_p(xi) = chi^2(q || p) / kappa^2. ``warning`` names a pair that
+matters where max q/p is above sqrt(n): what the data say of it rests on a handful of tuples. A successor that was never
+seen shows at no optimism.
 
 The bootstrap draws n(s,a) successors anew for every pair (multinomial; the reward's mean with the noise left at a given
 successor), and solves each model. It includes the second order, and subtracts nothing.
@@ -300,8 +300,8 @@ def _plug_in(
     optimal: bool,
     value: np.ndarray | None = None,
 ) -> Estimate:
-    """J of ``policy`` [n, A], on the problem's states; ``optimal``: the policy moves with the data. ``value`` [n]: about
-    its relative value, where that is known."""
+    """J of ``policy`` [n, A], on the problem's states; ``optimal``: the policy moves with the data. ``value`` [n]: its
+    relative value, about, where that is known."""
     problem = empirical.problem
     here = _worth(problem, policy, value)
     d = np.zeros(model.visits.shape)
@@ -511,15 +511,7 @@ def _furthest(
         log_price = _root(spent)
         spent(log_price)
         reward = np.add.reduceat(moved * given, p.indptr[:-1]) + slope * np.exp(-log_price) * noise
-        transition = sp.csr_array((moved.copy(), p.indices, p.indptr), shape=p.shape)
-        if problem.optimism:  # the tilt is of successors that there are
-            transition = transition.copy()
-            transition.eliminate_zeros()
-        model_there = replace(
-            problem,
-            transition=transition,
-            reward=problem.reward + reward.reshape(problem.reward.shape),
-        )
+        model_there = _with_rows(problem, p, moved, reward)
         try:
             if optimal:
                 now = _optimum(model_there, now.value, 0.1 * END_TOLERANCE * abs(best - here.gain))
@@ -537,6 +529,14 @@ def _furthest(
             if not tied or idle == PATIENCE:
                 return best
     return best
+
+
+def _with_rows(problem: BellmanProblem, p: sp.csr_array, moved: np.ndarray, reward: np.ndarray) -> BellmanProblem:
+    """``problem`` with rows ``moved`` (the data of ``p``), and ``reward`` [n*A] added."""
+    transition = sp.csr_array((moved.copy(), p.indices.copy(), p.indptr.copy()), shape=p.shape)
+    if problem.optimism:  # the tilt is of successors that there are
+        transition.eliminate_zeros()
+    return replace(problem, transition=transition, reward=problem.reward + reward.reshape(problem.reward.shape))
 
 
 def _root(falling: Callable[[float], float]) -> float:
@@ -598,11 +598,12 @@ def _second_order(
 ) -> tuple[float, float]:
     """(how far noise in the rows moves J on average, standard error of that); docs/theory.md, 4.
 
-    At optimism 0, with e(s,a) the error of the mean of r + V(s') and Z = (I - K + 1 d)^-1: dV = Z (sum_a pi e), and on average over d
+    At optimism 0, with e(s,a) the error of the mean of r + V(s') and Z = (I - K + 1 d)^-1: dV = Z (sum_a pi e), and on
+    average over d
 
         sum_a pi (dp dV) + (beta/2) Var_pi(e + p dV),        the second term if the policy moves along.
 
-    Otherwise e is that of r + xi, K and p dV become those of q, dp dV is weighted by q/p less the mean of dV under q, and
+    Otherwise e is that of r + xi, K and p dV become those of q, dp dV becomes dp (q/p) (dV - q dV), and
     (kappa/2) (Var_q(dV) - Var_p(xi)/n) is added: C has a second order of its own.
 
     That is tr(M Z) + sum |H Z diag(source)^1/2|^2, column by column; of more than BIAS_STATES states, the mean over
@@ -675,12 +676,12 @@ def _process(problem: BellmanProblem, policy: np.ndarray, here: _Worth) -> Regen
 
 def _by_state(table: np.ndarray) -> sp.csr_array:
     """Rows [n, n*A] that weigh the pairs of each state by ``table`` [n, A]."""
-    n, n_actions = table.shape
-    return sp.csr_array((table.ravel(), np.arange(table.size), np.arange(0, table.size + 1, n_actions)))
+    ends = np.arange(0, table.size + 1, table.shape[1])
+    return sp.csr_array((table.ravel(), np.arange(table.size), ends))
 
 
 def _warning(model: EmpiricalMDP, rows: _Rows, counts: np.ndarray) -> str:
-    """That a pair among ``counts`` (of [S*A]) has a successor of whose weight q/p few tuples tell; "" where none has."""
+    """That a pair among ``counts`` (of [S*A]) has a successor of whose weight q/p few tuples tell; "" if none has."""
     p = model.transition
     pair = np.repeat(np.arange(model.visits.size), np.diff(p.indptr))
     ratio = np.where((rows.share > 0) & np.isin(pair, counts), rows.ratio, 0.0)

@@ -145,7 +145,8 @@ def compare(
         report: called with (fits done, fits in all).
 
     Raises:
-        InputError: an argument out of range; learners of different beta, optimism or prior; a model without one optimum.
+        InputError: an argument out of range; learners of different beta, optimism or prior; a model that has not one
+            optimum.
     """
     names = tuple(learners)
     if not names:
