@@ -401,7 +401,7 @@ def _worth(problem: BellmanProblem, policy: np.ndarray, value: np.ndarray | None
 def _effect(problem: BellmanProblem, here: _Worth, to: np.ndarray, row: np.ndarray) -> np.ndarray:
     """What a share of probability of the successors ``to`` adds to J in ``row`` (of [n*A]): V(s'), or xi - 1/kappa."""
     if not problem.optimism:
-        return here.value[to]
+        return np.asarray(here.value[to])
     return np.asarray(np.expm1(problem.kappa * (here.value[to] - here.certain[row])) / problem.kappa)
 
 

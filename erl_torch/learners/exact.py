@@ -99,8 +99,8 @@ class Exact:
     def solve(self, mdp: TabularMDP) -> Solution:
         """The solution with its certificate."""
         solve = solve_biasing if self.method == "biasing" else solve_soft_bellman
-        options = {"tol": self.tol, "max_steps": self.max_steps, "optimism": self.optimism}
-        return solve(mdp, self.beta, self.prior_policy, **options)
+        given = mdp, self.beta, self.prior_policy
+        return solve(*given, tol=self.tol, max_steps=self.max_steps, optimism=self.optimism)
 
     def init(self, n_states: int, n_actions: int) -> ExactState:
         """The prior policy, before anything is known."""
@@ -134,8 +134,8 @@ class Exact:
                 if newton.step or problem.is_narrow(newton.theta_bounds, self.tol, newton.policy):
                     yield full(newton.step, newton, 0.5 * sum(newton.theta_bounds), 0.0)
             return
-        options = {"max_steps": self.max_steps, "optimism": self.optimism}
-        for state in iterate_biasing(mdp, self.beta, self.prior_policy, **options):
+        given = mdp, self.beta, self.prior_policy
+        for state in iterate_biasing(*given, max_steps=self.max_steps, optimism=self.optimism):
             yield full(state.k + 1, state, state.theta, float(state.kl.max()))
             if problem.is_narrow(state.theta_bounds, self.tol, state.policy):
                 return

@@ -418,35 +418,43 @@ class Judges:
             if (succeeds := self.of_success) is not None:
                 figures["success_rate"] = self.problem.horizon * each(lambda r: succeeds.reward_per_step(policies[r]))
         elif self.problem.env is None:
-            judges = self.of_data * len(policies) if len(self.of_data) == 1 else self.of_data
-            told = list(zip(judges, policies, self.dial, strict=True))
-
-            def of_counts(real: bool) -> np.ndarray:
-                return np.array(
-                    [
-                        np.nan if judge is None else judge.objective(policy, beta, optimism=0.0 if real else optimism)
-                        for judge, policy, (beta, optimism) in told
-                    ]
-                )
-
-            figures["objective"] = of_counts(False)
-            if self.of_dial:
-                figures["objective_real"] = of_counts(True)
+            figures |= self._of_counts(policies)
         elif milestone:
-            p, env = self.problem, self.problem.env
-            played = [
-                evaluate(env, policy, beta, rng, self.n_episodes, p.horizon, p.prior, ends=p.ends)
-                for policy, (beta, _), rng in zip(policies, self.dial, self.rngs, strict=True)
-            ]
-            figures["return"] = np.array([one.mean_return for one in played])
-            if p.ends is not None:
-                figures["success_rate"] = np.array([one.success_rate for one in played])
-            if self.model is None:
-                figures["reward_per_step"] = np.array([one.reward_per_step for one in played])
-                real = np.array([one.objective for one in played])
-                figures["objective"] = np.where([optimism != 0 for _, optimism in self.dial], np.nan, real)
-                if self.of_dial:
-                    figures["objective_real"] = real
+            figures |= self._played(policies)
+        return figures
+
+    def _of_counts(self, policies: np.ndarray) -> dict[str, np.ndarray]:
+        """Objectives in the models of the counts."""
+        judges = self.of_data * len(policies) if len(self.of_data) == 1 else self.of_data
+        told = list(zip(judges, policies, self.dial, strict=True))
+
+        def objectives(real: bool) -> np.ndarray:
+            return np.array(
+                [
+                    np.nan if judge is None else judge.objective(policy, beta, optimism=0.0 if real else optimism)
+                    for judge, policy, (beta, optimism) in told
+                ]
+            )
+
+        return {"objective": objectives(False)} | ({"objective_real": objectives(True)} if self.of_dial else {})
+
+    def _played(self, policies: np.ndarray) -> dict[str, np.ndarray]:
+        """Of episodes, which tell of the real world alone."""
+        p, env = self.problem, self.problem.env
+        assert env is not None
+        played = [
+            evaluate(env, policy, beta, rng, self.n_episodes, p.horizon, p.prior, ends=p.ends)
+            for policy, (beta, _), rng in zip(policies, self.dial, self.rngs, strict=True)
+        ]
+        figures = {"return": np.array([one.mean_return for one in played])}
+        if p.ends is not None:
+            figures["success_rate"] = np.array([one.success_rate for one in played])
+        if self.model is None:
+            figures["reward_per_step"] = np.array([one.reward_per_step for one in played])
+            real = np.array([one.objective for one in played])
+            figures["objective"] = np.where([optimism != 0 for _, optimism in self.dial], np.nan, real)
+            if self.of_dial:
+                figures["objective_real"] = real
         return figures
 
 

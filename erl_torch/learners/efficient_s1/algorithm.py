@@ -755,10 +755,10 @@ class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
         span = max(*sizes, stream.log_factor_max, -log_z.min(), abs(state.log_rho))
         with np.errstate(all="ignore"):
             if self.log_domain == "off" or (self.log_domain == "auto" and span < SAFE_RANGE):
-                tables = [np.exp(x) for x in (log_g, log_z, log_total)]
-                rho, healthy = self._stream(np.exp, state, stream, *tables, tuple(map(np.exp, tilt)))
+                g, z, total = np.exp(log_g), np.exp(log_z), np.exp(log_total)
+                rho, healthy = self._stream(np.exp, state, stream, g, z, total, tuple(map(np.exp, tilt)))
                 if healthy:
-                    return np.log(tables[1]) + gauge, np.log(tables[2]) + gauge, math.log(rho)
+                    return np.log(z) + gauge, np.log(total) + gauge, math.log(rho)
                 if self.log_domain == "off":
                     raise NonFiniteError(
                         state.n_tuples,
@@ -839,10 +839,9 @@ class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
         tables = {name: getattr(state, name).copy() for name in names}
         log_z = state.log_z.numpy().copy()
         lr_rho = self.lr_u / n_states if self.lr_rho is None else self.lr_rho
-        kernel, kappa, of_least = kernels.online_phase, (), ()
-        if self.optimism:
-            kernel, kappa = kernels.tilted_online_phase, (self.kappa,)
-            of_least = state.log_least, state.n_tuples, max(LEAST_EVERY, n_states)
+        kernel = kernels.tilted_online_phase if self.optimism else kernels.online_phase
+        kappa = (self.kappa,) if self.optimism else ()
+        of_least = (state.log_least, state.n_tuples, max(LEAST_EVERY, n_states)) if self.optimism else ()
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             log_rho, log_rho_max, *log_least = kernel(
                 pair,
