@@ -378,7 +378,7 @@ def _worth(problem: BellmanProblem, policy: np.ndarray, value: np.ndarray | None
     value = np.zeros(problem.n_states) if value is None else value - value[ref]
     change, certain, tilted = backed_up(value)
     for _ in range(MAX_STEPS):
-        lu = RegenerativeLU.adapted(problem.chain(policy, tilted), ref, problem.elimination)
+        lu = problem.regeneration(policy, ref, tilted)
         step, share = lu.poisson(change)[1], 1.0
         while True:
             there = backed_up(value + share * step)
@@ -393,7 +393,7 @@ def _worth(problem: BellmanProblem, policy: np.ndarray, value: np.ndarray | None
             break
     if not np.ptp(change) <= UNSOLVED * problem.reward_range:
         raise SingularChainError("no relative value")
-    lu = RegenerativeLU.adapted(problem.chain(policy, tilted), ref, problem.elimination)
+    lu = problem.regeneration(policy, ref, tilted)
     d = lu.stationary()
     return _Worth(float(d @ change), d[:, None] * policy, value, certain, tilted)
 
@@ -667,11 +667,7 @@ def _second_order(
 
 def _process(problem: BellmanProblem, policy: np.ndarray, here: _Worth) -> RegenerativeLU:
     """The LU of the chain of ``policy`` [n, A] and q."""
-    if not problem.optimism:
-        return problem.regeneration(policy)
-    ref = problem.regeneration_state()
-    assert ref is not None
-    return RegenerativeLU.adapted(problem.chain(policy, here.tilted), ref, problem.elimination)
+    return problem.regeneration(policy, tilted=here.tilted if problem.optimism else None)
 
 
 def _by_state(table: np.ndarray) -> sp.csr_array:

@@ -106,7 +106,8 @@ class CertaintyEquivalence(StreamLearner[CertaintyEquivalenceState, CertaintyEqu
 
     def fit(self, transitions: Experience, n_states: int, n_actions: int) -> Solution:
         """Count and solve. Status REDUCIBLE, with a message, where the states that the stream shows are not one
-        recurrent class; theta is then that of the closed set of states (of several, the most visited)."""
+        recurrent class; theta is then that of the closed set of states (of several, the most visited). NO_SINGLE_RATE,
+        below optimism 0, where the data have none: then there is no theta."""
         return super().fit(transitions, n_states, n_actions)
 
     def finished(self, state: CertaintyEquivalenceState) -> bool:
@@ -134,7 +135,9 @@ class CertaintyEquivalence(StreamLearner[CertaintyEquivalenceState, CertaintyEqu
         assert answer.theta_bounds is not None
         lower, upper = answer.theta_bounds
         theta, message, status = answer.theta, part.message, Status.REDUCIBLE if part.reducible else answer.status
-        if theta is None:  # states are left for ever in the data, where other states may be better
+        if answer.status is Status.NO_SINGLE_RATE:
+            message = "; ".join(filter(None, (part.message, answer.message, proven((lower, upper), None))))
+        elif theta is None:  # states are left for ever in the data, where other states may be better
             ending = solve_problem(part.problem.ending(), stream.model, None, self.tol, self.max_steps)
             theta = ending.theta
             assert theta is not None
@@ -143,8 +146,9 @@ class CertaintyEquivalence(StreamLearner[CertaintyEquivalenceState, CertaintyEqu
             message = "; ".join(
                 filter(None, (part.message, answer.message, f"in the data, {proven((lower, upper), None)}"))
             )
+        estimate = 0.5 * (lower + upper) if theta is None else theta
         with np.errstate(over="ignore", under="ignore"):
-            rho = float(np.exp(-self.beta * (theta + answer.reward_bias_max))) if answer.rho is None else answer.rho
+            rho = float(np.exp(-self.beta * (estimate + answer.reward_bias_max))) if answer.rho is None else answer.rho
         known = torch.from_numpy(part.used | ~part.used.any(1, keepdims=True))
         reward_bias = answer.reward_bias
         if self.prior_policy is not None:  # actions that a state lacks have none
@@ -155,7 +159,7 @@ class CertaintyEquivalence(StreamLearner[CertaintyEquivalenceState, CertaintyEqu
             u=answer.u * known,
             reward_bias=reward_bias,
             theta=theta,
-            rho=rho,
+            rho=None if theta is None else rho,
             theta_bounds=None,  # what is proven of the empirical model is not proven of the true one
             gap=None,
             n_steps=stream.n_tuples,
@@ -169,7 +173,7 @@ class CertaintyEquivalence(StreamLearner[CertaintyEquivalenceState, CertaintyEqu
             policy=answer.policy,
             u=answer.u,
             rho=rho,
-            theta=theta,
+            theta=estimate,
             reward_bias=reward_bias,
             empirical_width=upper - lower,
             answer=answer,

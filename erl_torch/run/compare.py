@@ -226,7 +226,12 @@ def _run(
         began = time.perf_counter()
         solution = learner.fit(data.first(size), mdp.n_states, mdp.n_actions)
         seconds = time.perf_counter() - began
-        rows.append((measure(mdp, best, solution, learner.beta) | {"seconds": seconds}, solution.status))
+        rows.append(
+            (
+                measure(mdp, best, solution, learner.beta, prior, optimism=learner.optimism) | {"seconds": seconds},
+                solution.status,
+            )
+        )
     return rows
 
 

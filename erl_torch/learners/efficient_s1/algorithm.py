@@ -1003,8 +1003,8 @@ def certificate(part: EmpiricalProblem, log_psi: np.ndarray, policy: np.ndarray)
     problem = part.problem
     value = -log_psi[problem.states] / problem.beta
     parts = (problem.transition, problem.reward, problem.prior, problem.beta)
-    low, _ = policy_gains(*parts, within(part, policy), value)
-    return float(low.min()), float(gains(*parts, value).high.max())
+    low, _ = policy_gains(*parts, within(part, policy), value, problem.kappa)
+    return float(low.min()), float(gains(*parts, value, problem.kappa).high.max())
 
 
 def is_narrow(part: EmpiricalProblem, bounds: tuple[float, float], tol: float, policy: np.ndarray) -> bool:
