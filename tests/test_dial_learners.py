@@ -204,7 +204,7 @@ def test_arguments_are_named():
         for learner in (CertaintyEquivalence, EfficientS1, erl_torch.learners.Exact):
             with pytest.raises(InputError, match="optimism="):
                 learner(5.0, optimism)
-    with pytest.raises(InputError, match="reward_noise=.*mean.*joint"):
+    with pytest.raises(InputError, match=r"reward_noise=.*mean.*joint"):
         CertaintyEquivalence(reward_noise="both")
     for off in ("sample_mean_psi", "mean_reward"):
         with pytest.raises(InputError, match="reward_noise='joint': must be mean without sample_mean_psi"):
@@ -366,5 +366,5 @@ def test_a_comparison_is_of_one_optimism():
     assert found.theta == pytest.approx(solve_soft_bellman(mdp, 3.0, optimism=1.0).theta, abs=1e-9)
     assert found.measures["gap"].max() < 0.01
     np.testing.assert_allclose(found.measures["gap"][0], found.measures["gap"][1], atol=1e-6)
-    with pytest.raises(InputError, match="s1: optimism=0.0: must be that of ce, 1: one objective for all"):
+    with pytest.raises(InputError, match=r"s1: optimism=0\.0: must be that of ce, 1: one objective for all"):
         compare(mdp, learners | {"s1": EfficientS1(3.0)}, 5, 1000, seeds=1)
