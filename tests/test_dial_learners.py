@@ -154,6 +154,7 @@ def test_kernels_back_up_the_tilted_mean(problem, kappa, average, factors):
     data = random_stream(rng, mdp, n)
     tilt, share = np.exp(kappa * rng.random(n_states)), rng.uniform(0.5, 2, n_states * n_actions)
     g, z_0 = rng.uniform(0.2, 1, share.size), rng.uniform(0.5, 2, share.size)
+    largest = rng.uniform(0.2, 1, share.size)
     factor = rng.uniform(0.5, 2, n) if factors else np.ones(1)
     steps, members = np.linspace(1, 0.1, 6), np.arange(n_states)
     z, rho, total, visits, least = z_0.copy(), 0.7, np.zeros(share.size), np.zeros(share.size, int), np.inf
@@ -163,7 +164,7 @@ def test_kernels_back_up_the_tilted_mean(problem, kappa, average, factors):
         k = data.s[t] * n_actions + data.a[t]
         e = tilt[data.s_next[t]] * share[k] * (factor[t] if factors else 1.0)
         w = g[k] * (least + e * (y[data.s_next[t]] - least))
-        z[k] += steps[min(visits[k], 5)] * (w / rho - z[k])
+        z[k] += min(steps[min(visits[k], 5)], largest[k]) * (w / rho - z[k])
         visits[k] += 1
         total[k] += z[k] if average else 0.0
         rho = min(rho + 0.05 * (w / z[k] - rho), 5.0)
@@ -176,7 +177,7 @@ def test_kernels_back_up_the_tilted_mean(problem, kappa, average, factors):
         tables = [number(np.log(x)) for x in (g, tilt, share, z_0)]
         sums, counts = number(np.full(share.size, -np.inf)), np.zeros(share.size, np.int64)
         found, healthy = kernel(
-            pair, data.s_next, number(np.log(factor)), factors, *tables[:3], members, tables[3], sums, average,
+            pair, data.s_next, number(np.log(factor)), factors, *tables[:3], largest, members, tables[3], sums, average,
             number(np.log(weight)), n_actions, steps, counts, float(number(np.log(0.7))), 0.05,
             float(number(np.log(5.0))), 5000, 0, n,
         )  # fmt: skip
@@ -207,10 +208,10 @@ def test_arguments_are_named():
     with pytest.raises(InputError, match=r"reward_noise=.*mean.*joint"):
         CertaintyEquivalence(reward_noise="both")
     for off in ("sample_mean_psi", "mean_reward"):
-        with pytest.raises(InputError, match="reward_noise='joint': must be mean without sample_mean_psi"):
+        with pytest.raises(InputError, match="reward_noise=joint: must be mean where sample_mean_psi"):
             EfficientS1(reward_noise="joint", **{off: False})
     data = random_stream(np.random.default_rng(0), random_mdp(np.random.default_rng(0), 3, 2), 50)
-    with pytest.raises(InputError, match="reward_noise='joint': must be mean in the online mode"):
+    with pytest.raises(InputError, match="reward_noise=joint: must be mean in the online mode"):
         next(EfficientS1(optimism=1.0, reward_noise="joint").online([data], 3, 2))
 
 

@@ -49,7 +49,8 @@ E V gives way to C V = (1/kappa) log E exp(kappa V(s')) on the empirical rows, a
 
 ``sample_mean_psi`` counts for <psi^-lam> = exp(kappa C V) as for <log psi>. With it, ``mean_reward`` and
 ``expected_backup``, c + e (y(s') - c) is backed up in place of e y(s'), c the least y: of the same mean over the
-visits, as that of e is known from the counts, and again without noise where y = 1. Otherwise e is streamed as it comes,
+visits, as that of e is known from the counts, and again without noise where y = 1. No step is then above 1/<e^2> of
+its pair, beyond which noise would grow. Otherwise e is streamed as it comes,
 and at constant steps that never goes away. The fixed point is certainty equivalence at that optimism, whose C is itself
 too small by about CV^2 / (2 kappa n), CV^2 the relative variance of exp(kappa V(s')): rows need n far above that.
 
@@ -289,6 +290,7 @@ class EfficientStream:
     noisy: bool  # each tuple's own r is in the third column
     own_reward: bool  # ... as exp(beta r), in place of the mean reward
     log_factor_max: float  # of the third column
+    squares: EmpiricalMDP  # ... at 2 kappa
     model: EmpiricalMDP  # where rewards count jointly with s', their ``joint``
     part: EmpiricalProblem
     weight: torch.Tensor  # [S, A]
@@ -375,7 +377,7 @@ class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
         checks.one_of("unvisited", self.unvisited, ("exclude", "initial"))
         checks.one_of("reward_noise", self.reward_noise, NOISE)
         if self.reward_noise == "joint" and not (self.sample_mean_psi and self.mean_reward):
-            raise InputError("reward_noise", "joint", "mean without sample_mean_psi and mean_reward: they count it")
+            raise InputError("reward_noise", "joint", "mean where sample_mean_psi or mean_reward is off")
 
     @classmethod
     def published(cls, beta: float = 10.0, **options: object) -> EfficientS1:
@@ -531,6 +533,7 @@ class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
                 model = empirical_mdp(data, n_states, n_actions, found)
             weight = prior * (part.used | ~taken[:, None])
         together = self.reward_noise == "joint" and self.optimism != 0 and found.varied
+        squares = joint(model, data, 2 * self.kappa) if together else model
         if together:
             model = joint(model, data, self.kappa)
             part = replace(part, problem=model.problem(self.beta, self.prior_policy, optimism=self.optimism).problem)
@@ -560,6 +563,7 @@ class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
             noisy=noisy,
             own_reward=own_reward,
             log_factor_max=max(abs(unit * r) for r in found.reward_range) if noisy else 0.0,
+            squares=squares,
             model=model,
             part=part,
             weight=torch.from_numpy(weight),
@@ -768,6 +772,15 @@ class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
             log_rho, _ = self._stream(np.asarray, state, stream, log_g, log_z, log_total, tilt)
         return log_z + gauge, log_total + gauge, log_rho
 
+    def _largest_steps(self, state: EfficientState, stream: EfficientStream) -> np.ndarray:
+        """1 / <e^2> of each pair, [S*A]: larger steps would let noise grow."""
+        model, h = stream.squares, -2.0 * self.optimism * state.log_psi_in_use.numpy()
+        p, found = model.transition, np.empty(state.log_z.numel())
+        solvers_kernels.tilt_rows(p.indptr, p.indices, p.data, h, found, np.empty(len(found)), np.empty(p.nnz))
+        found += 2.0 * self.optimism * state.mean_log_psi.numpy().ravel()
+        found += 2.0 * self.kappa * (model.reward - stream.model.reward).ravel()
+        return np.exp(-np.maximum(found, 0.0))
+
     def _stream(
         self,
         number: Callable[[Any], Any],
@@ -794,7 +807,7 @@ class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
             kernel = kernels.tilted_gauge_epoch if plain else kernels.log_tilted_gauge_epoch
         else:
             kernel = kernels.gauge_epoch if plain else kernels.log_gauge_epoch
-        of_tilt = (tilt[0], tilt[1].ravel(), stream.members) if tilt else ()
+        of_tilt = (tilt[0], tilt[1].ravel(), self._largest_steps(state, stream), stream.members) if tilt else ()
         which = () if tilt else (self.expected_backup,)
         t = 0
         for pair, after, log_factor in stream.parts:

@@ -147,14 +147,15 @@ def log_gauge_epoch(
 
 @numba.njit(cache=True, error_model="numpy", nogil=True)
 def tilted_gauge_epoch(
-    pair, s_next, factor, noisy, g, tilt, share, members, z, total, average, weight, n_actions, steps, visits, rho,
-    lr_rho, rho_max, rescale_every, begin, end, first=0,
+    pair, s_next, factor, noisy, g, tilt, share, largest_step, members, z, total, average, weight, n_actions, steps,
+    visits, rho, lr_rho, rho_max, rescale_every, begin, end, first=0,
 ):  # fmt: skip
     """``gauge_epoch`` with y(s') tilted by e = tilt(s') share(s,a) (times ``factor`` where ``noisy``), whose mean over
     the visits of each pair is 1.
 
     What is backed up is c + e (y(s') - c), c the least y of the states ``members``: of the same mean over the visits as
-    e y(s'), whatever c is, of positive numbers, and without noise where y is the same in all states.
+    e y(s'), whatever c is, of positive numbers, and without noise where y is the same in all states. No step of a pair
+    is above its ``largest_step``.
     """
     n_states = z.size // n_actions
     y = np.zeros(n_states)
@@ -175,7 +176,7 @@ def tilted_gauge_epoch(
             if noisy:
                 e *= factor[i]
             w = g[k] * (least + e * (y[s_next[i]] - least))
-            step = steps[min(visits[k], last)]
+            step = min(steps[min(visits[k], last)], largest_step[k])
             visits[k] += 1
             z_new = (1.0 - step) * z[k] + step * w / rho
             z[k] = z_new
@@ -213,8 +214,8 @@ def _log_backed_up(log_least, log_e, log_y):
 
 @numba.njit(cache=True, error_model="numpy", nogil=True)
 def log_tilted_gauge_epoch(
-    pair, s_next, log_factor, noisy, log_g, log_tilt, log_share, members, log_z, log_total, average, log_weight,
-    n_actions, steps, visits, log_rho, lr_rho, log_rho_max, rescale_every, begin, end, first=0,
+    pair, s_next, log_factor, noisy, log_g, log_tilt, log_share, largest_step, members, log_z, log_total, average,
+    log_weight, n_actions, steps, visits, log_rho, lr_rho, log_rho_max, rescale_every, begin, end, first=0,
 ):  # fmt: skip
     """``tilted_gauge_epoch`` in logarithms: finite for finite input of any size. Returns (log rho, true)."""
     n_states = log_z.size // n_actions
@@ -234,7 +235,7 @@ def log_tilted_gauge_epoch(
             if noisy:
                 e += log_factor[i]
             w = log_g[k] + _log_backed_up(least, e, y[s_next[i]])
-            step = steps[min(visits[k], last)]
+            step = min(steps[min(visits[k], last)], largest_step[k])
             visits[k] += 1
             z_new = _log_blend(log_z[k], w - log_rho, step)
             log_z[k] = z_new
