@@ -12,6 +12,7 @@ function of the solution is one equation with its transpose (docs/theory.md, Inv
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -79,8 +80,14 @@ class Linearised:
     policy: np.ndarray  # pi*, [n, A]
     log_ratio: np.ndarray  # log(pi*/prior), [n, A]; 0 where the prior is 0
     tilted: sp.csr_array  # q*, [n*A, n]
+    chain: sp.csr_array  # K, [n, n]
     share: np.ndarray  # d*, stationary under K, [n]
-    lu: Bordered
+    width: float  # max (TV - V) - min (TV - V) but for rounding
+
+    @cached_property
+    def lu(self) -> Bordered:
+        """Raises SingularChainError."""
+        return Bordered(self.chain, int(np.argmax(self.share)))
 
     def slope(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """xi(s'|s,a) less its mean over p: the change of C V of pair ``rows`` with p of state ``columns``."""
@@ -134,8 +141,8 @@ class Linearised:
         return np.bincount(rows, p.data * terms, p.shape[0]) / kappa**2
 
 
-def linearise(problem: BellmanProblem, value: np.ndarray) -> Linearised:
-    """Derivatives at the solution next to ``value`` [n], to which Newton steps lead first.
+def linearise(problem: BellmanProblem, value: np.ndarray, steps: int = LAST_STEPS) -> Linearised:
+    """Derivatives at the solution next to ``value`` [n], to which at most ``steps`` Newton steps lead first.
 
     Raises:
         SingularChainError: the solution's chain has no single closed class, as far as double precision can tell.
@@ -144,7 +151,7 @@ def linearise(problem: BellmanProblem, value: np.ndarray) -> Linearised:
     if ref is None:
         raise SingularChainError("several closed classes")
     value = value - value.mean()
-    for _ in range(LAST_STEPS):
+    for _ in range(steps):
         certain, tilted = _ahead(problem, value)
         backed_up, policy = _backup(problem, certain)
         chain = problem.chain(policy, tilted)
@@ -154,7 +161,6 @@ def linearise(problem: BellmanProblem, value: np.ndarray) -> Linearised:
         if problem.beta * np.ptp(change) < NEAR:
             break
     share = lu.stationary()
-    bordered = Bordered(chain, int(np.argmax(share)))
     certain, tilted = _ahead(problem, value)
     backed_up, policy = _backup(problem, certain)
     q = problem.reward + certain.reshape(policy.shape)
@@ -167,8 +173,9 @@ def linearise(problem: BellmanProblem, value: np.ndarray) -> Linearised:
         policy=policy,
         log_ratio=np.where(problem.prior > 0, problem.beta * (q - backed_up[:, None]), 0.0),
         tilted=p if tilted is None else sp.csr_array((tilted, p.indices, p.indptr), shape=p.shape),
+        chain=chain,
         share=share,
-        lu=bordered,
+        width=float(np.ptp(backed_up - value)),
     )
 
 
