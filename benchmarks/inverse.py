@@ -59,7 +59,7 @@ def maximised(
         reward = phi @ weights
         found = goal(reward, soft_bellman(reward, values, beta=beta, pattern=mdp.transition))
         found = found - penalty * (weights @ weights) / 2
-        found.backward()  # type: ignore[no-untyped-call]
+        found.backward()
         assert weights.grad is not None
         return -found.item(), -weights.grad.numpy()
 
@@ -123,7 +123,7 @@ def cliff_features() -> dict[str, np.ndarray | None]:
 def loss(policy: np.ndarray) -> float:
     """g* - J in the true cliff, reward a step."""
     best = solve_soft_bellman(CLIFF, BETA)
-    return -best.theta - objective(CLIFF, policy, np.full((15, 4), 0.25), BETA)  # type: ignore[operator]
+    return -best.theta - objective(CLIFF, policy, np.full((15, 4), 0.25), BETA)
 
 
 def every_pair(features: np.ndarray | None) -> np.ndarray:
@@ -217,8 +217,8 @@ def page(parts: dict[str, Any]) -> str:
             "## Windy cliff",
             "",
             "Loss, g* - J in the true problem (beta 10), of the policy that is best for the reward found: from the "
-            f"expert's exact policy; from 10,000 steps, {found['n']} seeds (raw features: 10, and penalty 1e-4, without which "
-            "their weights run away).",
+            f"expert's exact policy; from 10,000 steps, {found['n']} seeds (raw features: 10, and "
+            "penalty 1e-4, without which their weights run away).",
             "",
             "| features | exact | seconds | balanced, median | largest | raw features, median |",
             "|---|---|---|---|---|---|",
@@ -231,8 +231,8 @@ def page(parts: dict[str, Any]) -> str:
         lines += [
             "## Beside the tabular MCE IRL of `imitation`",
             "",
-            "Windy cliff, the same 10 episodes of 1,000 steps, a reward for each state, one run on one machine. MCE IRL "
-            "has the episodes' horizon, 1,000, a linear reward, and Adam; .01 is its default. Loss: of the policy that "
+            "Windy cliff, the same 10 episodes of 1,000 steps, a reward for each state, one run on one machine. MCE "
+            "IRL has the episodes' horizon, 1,000, a linear reward, and Adam; .01 is its default. Loss: of the policy that "
             "is best for its reward in the endless problem, and of the policy of its own first step.",
             "",
             "| by | seed | loss | own policy's | seconds | times ours |",

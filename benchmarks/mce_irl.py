@@ -15,7 +15,7 @@ import time
 
 import numpy as np
 import torch
-from imitation.algorithms import base, mce_irl  # type: ignore[import-not-found]
+from imitation.algorithms import mce_irl  # type: ignore[import-not-found]
 from imitation.rewards import reward_nets  # type: ignore[import-not-found]
 from seals.base_envs import TabularModelPOMDP  # type: ignore[import-not-found]
 
@@ -31,7 +31,9 @@ def main() -> None:
         horizon=horizon,
         initial_state_dist=given["start"],
     )
-    shares = np.bincount(episodes.ravel(), minlength=n_states) / len(episodes)  # states of an episode, as it counts them
+    shares = np.bincount(episodes.ravel(), minlength=n_states) / len(
+        episodes
+    )  # as it counts states
     torch.manual_seed(0)
     net = reward_nets.BasicRewardNet(
         env.observation_space,

@@ -5,10 +5,23 @@ import pytest
 import scipy.sparse as sp
 import torch
 from helpers import maze
+from oracle import stationary
 
-from erl_torch import InputError, TabularMDP, soft_bellman
+from erl_torch import (
+    InputError,
+    Note,
+    Status,
+    TabularMDP,
+    Transitions,
+    collect,
+    empirical_mdp,
+    fit_reward,
+    soft_bellman,
+    solve_soft_bellman,
+)
 from erl_torch.envs.windy_cliff import WindyCliffEnv
 from erl_torch.inverse import derivatives
+from erl_torch.solvers.policy import objective
 
 CLIFF = WindyCliffEnv().mdp
 OPTIMISM = [1.0, 0.5, 0.0, -1.0, -3.0]
@@ -46,7 +59,7 @@ def random_problem(seed, n_states=4, n_actions=3):
 @pytest.mark.parametrize("optimism", OPTIMISM)
 def test_function_solves_the_equation(optimism):
     r, p, prior = random_problem(1)
-    theta, value, log_policy = soft_bellman(*tensors(r, p, prior), 2.0, optimism=optimism)
+    theta, value, log_policy = soft_bellman(*tensors(r, p, prior), beta=2.0, optimism=optimism)
     v, g = relative_value(p, r, prior, 2.0, optimism)
     assert theta.item() == pytest.approx(-g, abs=1e-12)
     assert value.detach().numpy() == pytest.approx(v, abs=1e-11)
@@ -59,8 +72,8 @@ def test_gradients_of_dense_problems(optimism, reference):
     r, p, prior = random_problem(2)
     inputs = *tensors(r, p, prior), torch.tensor(2.0, dtype=torch.float64, requires_grad=True)
 
-    def solve(*x):
-        return soft_bellman(*x, reference=reference, optimism=optimism)
+    def solve(r, p, prior, beta):
+        return soft_bellman(r, p, prior, beta, reference=reference, optimism=optimism)
 
     assert torch.autograd.gradcheck(solve, inputs, atol=1e-7, rtol=1e-5)
 
@@ -108,8 +121,8 @@ def test_gradients_on_the_cliff(optimism):
     direction[2][:] -= direction[2].mean(1, keepdims=True)
     inputs = tensors(CLIFF.reward, pattern.data, np.full((15, 4), 0.25))
 
-    def loss(*x):
-        theta, value, log_policy = soft_bellman(*x, 5.0, pattern, 13, optimism=optimism)
+    def loss(r, values, prior):
+        theta, value, log_policy = soft_bellman(r, values, prior, 5.0, pattern, 13, optimism=optimism)
         return theta + by_value @ value + (weight * log_policy).sum()
 
     loss(*inputs).backward()
@@ -211,3 +224,242 @@ def test_a_problem_without_a_solution_is_refused_by_its_status():
     stay = torch.eye(2, dtype=torch.float64)[:, None, :].expand(2, 2, 2)
     with pytest.raises(InputError, match="REDUCIBLE"):
         soft_bellman(torch.zeros(2, 2, dtype=torch.float64), stay, beta=1.0)
+
+
+# -- rewards from behaviour -------------------------------------------------------------------------------------
+
+BETA = 10.0
+EXPERT = solve_soft_bellman(CLIFF, BETA).policy.numpy()
+TILES = np.stack([CLIFF.reward[:, 0] == -5, CLIFF.reward[:, 0] == -1], 1).astype(float)  # trap, step; the goal pays 0
+
+
+def lost(policy):
+    """g* - J in the cliff."""
+    return -solve_soft_bellman(CLIFF, BETA).theta - objective(CLIFF, policy, np.full((15, 4), 0.25), BETA)
+
+
+def linear_problem(seed=0, n_states=6, n_actions=3, n_features=3):
+    """(MDP without rewards, features [S, A, F], weights, a function weights -> policy by the test's own solver)."""
+    rng = np.random.default_rng(seed)
+    p = 0.95 * rng.dirichlet(np.full(n_states, 0.5), size=(n_states, n_actions)) + 0.05 / n_states
+    features, start = rng.normal(size=(n_states, n_actions, n_features)), rng.dirichlet(np.ones(n_states))
+    prior = np.full((n_states, n_actions), 1 / n_actions)
+
+    def policy(w, beta=2.0, optimism=0.0):
+        v, _ = relative_value(p, features @ w, prior, beta, optimism)
+        kappa = optimism * beta
+        certain = p @ v if kappa == 0 else np.log((p * np.exp(kappa * v)).sum(2)) / kappa
+        weight = prior * np.exp(beta * (features @ w + certain))
+        return weight / weight.sum(1, keepdims=True)
+
+    return TabularMDP(p, np.zeros((n_states, n_actions)), start), features, rng.normal(size=n_features), policy
+
+
+@pytest.mark.parametrize("features", [TILES, np.eye(15), None], ids=["tiles", "states", "table"])
+def test_the_cliff_s_reward_from_its_exact_policy(features):
+    fit = fit_reward(EXPERT, features, mdp=CLIFF, beta=BETA, exact=True)
+    assert fit.converged
+    assert fit.solution.status is Status.CONVERGED
+    assert lost(fit.solution.policy.numpy()) < 1e-7
+    assert fit.gap < 1e-7
+    assert fit.standard_error is None
+    assert fit.n_steps == np.inf
+    if features is TILES:
+        assert fit.weights == pytest.approx([-5.0, -1.0], abs=1e-5)
+        assert fit.reward == pytest.approx(CLIFF.reward, abs=1e-5)
+        assert fit.message == ""
+
+
+@pytest.mark.slow
+def test_the_cliff_s_reward_from_ten_thousand_steps():
+    for seed in range(3):
+        data = collect(CLIFF, 1, 10_000, seed, EXPERT)
+        for features in (TILES, np.eye(15), None):
+            fit = fit_reward(data, features, mdp=CLIFF, beta=BETA)
+            assert lost(fit.solution.policy.numpy()) < 2e-3
+            assert "no demonstration meets" in fit.message  # the expert falls once in 500,000 steps
+        assert fit_reward(data, TILES, mdp=CLIFF, beta=BETA, names=["trap", "step"]).unmet == (0,)
+
+
+@pytest.mark.parametrize("optimism", [0.0, 0.5, 1.0])
+def test_weights_are_found_again(optimism):
+    mdp, features, w, policy = linear_problem()
+    fit = fit_reward(policy(w, optimism=optimism), features, mdp=mdp, beta=2.0, exact=True, optimism=optimism)
+    assert fit.weights == pytest.approx(w, abs=1e-7)
+    assert fit.gap == pytest.approx(0.0, abs=1e-12)
+    assert fit.identified.all()
+    assert fit.solution.optimism == optimism
+
+
+def test_objective_is_concave_and_is_the_likelihood_of_the_flow():
+    """l(w) = beta (<d_E, r_w> - g_w) by the test's own solver: the fit is its maximum, and along lines it is concave."""
+    mdp, features, w, policy = linear_problem(1)
+    rng, prior = np.random.default_rng(1), np.full((6, 3), 1 / 3)
+    p, expert = mdp.transition.toarray().reshape(6, 3, 6), rng.dirichlet(np.ones(3), size=6)  # no expert of any w
+    share = stationary(np.einsum("sa,sat->st", expert, p))[:, None] * expert
+
+    def likelihood(w):
+        return (share * np.log(policy(w) / prior)).sum()
+
+    def formula(w):
+        return 2.0 * ((share * (features @ w)).sum() - relative_value(p, features @ w, prior, 2.0, 0.0)[1])
+
+    fit = fit_reward(expert, features, mdp=mdp, beta=2.0, exact=True)
+    assert fit.log_likelihood == pytest.approx(likelihood(fit.weights), abs=1e-12)
+    for _ in range(10):
+        a, b = rng.normal(size=(2, 3))
+        assert formula(a) == pytest.approx(likelihood(a), abs=1e-12)
+        assert formula(a) <= fit.log_likelihood
+        assert formula((a + b) / 2) >= (formula(a) + formula(b)) / 2
+
+
+def test_information_is_the_second_derivative():
+    mdp, features, w, policy = linear_problem(2)
+    p, prior = mdp.transition.toarray().reshape(6, 3, 6), np.full((6, 3), 1 / 3)
+    fit = fit_reward(policy(w), features, mdp=mdp, beta=2.0, exact=True)
+    h, axes = 1e-3, np.eye(3)
+
+    def rate(w):
+        return relative_value(p, features @ w, prior, 2.0, 0.0)[1]
+
+    second = np.array([
+        [(rate(w + h * (i + j)) - rate(w + h * (i - j)) - rate(w - h * (i - j)) + rate(w - h * (i + j))) / (4 * h * h)
+         for j in axes] for i in axes
+    ])  # fmt: skip
+    assert fit.eigenvalues == pytest.approx(np.linalg.eigvalsh(2.0 * second), rel=1e-4)
+    steps = 1e9  # of the stream of the expert's flow: the errors are those of the inverse information
+    flow = stationary(np.einsum("sa,sat->st", policy(w), p))[:, None] * policy(w)
+    counted = fit_reward(steps * flow, features, mdp=mdp, beta=2.0)
+    expected = np.sqrt(np.diag(np.linalg.inv(2.0 * second * steps)))
+    assert counted.standard_error == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("episodes", "length"), [(1, 2000), (500, 4)])
+def test_errors_are_those_that_are_said_also_where_demonstrations_restart(episodes, length):
+    mdp, features, w, policy = linear_problem(3)
+    found, said = [], []
+    for seed in range(60):
+        fit = fit_reward(collect(mdp, episodes, length, seed, policy(w)), features, mdp=mdp, beta=2.0)
+        found.append(fit.weights - w)
+        said.append(fit.standard_error)
+    z = np.array(found) / np.array(said)
+    assert np.abs(z.mean(0)).max() < 4 / np.sqrt(60)  # no bias
+    assert z.std(0) == pytest.approx(np.ones(3), abs=4 / np.sqrt(120))
+
+
+def test_a_table_tells_all_but_shaping():
+    """Of S A rewards S directions are hidden: r = Phi(s) - E Phi(s') + c. The others' are found again."""
+    mdp, features, w, policy = linear_problem(4)
+    fit = fit_reward(policy(w), mdp=mdp, beta=2.0, exact=True)
+    assert fit.unidentified.shape == (18, 6)
+    assert not fit.identified.any()
+    rows = np.repeat(np.eye(6), 3, axis=0)
+    shaping = np.column_stack([rows - mdp.transition.toarray(), np.ones(18)])
+    inside = fit.unidentified @ (fit.unidentified.T @ shaping)
+    assert inside == pytest.approx(shaping, abs=1e-9)
+    off = (fit.reward - features @ w).ravel()
+    assert fit.unidentified @ (fit.unidentified.T @ off) == pytest.approx(off, abs=1e-6)
+    assert fit.solution.policy.numpy() == pytest.approx(policy(w), abs=1e-8)
+    assert "6 of 18 directions" in fit.message
+
+
+def test_shaped_and_repeated_features_are_named():
+    mdp, features, w, policy = linear_problem(5)
+    potential = np.arange(6.0)
+    hidden = potential[:, None] - (mdp.transition @ potential).reshape(6, 3) + 3.0
+    more = np.concatenate([features, hidden[:, :, None], 2 * features[:, :, :1]], axis=2)
+    fit = fit_reward(policy(w), more, mdp=mdp, beta=2.0, exact=True, names=["a", "b", "c", "shaped", "double"])
+    assert fit.identified.tolist() == [False, True, True, False, False]
+    assert fit.weights[1:3] == pytest.approx(w[1:], abs=1e-6)
+    assert fit.weights[3] == pytest.approx(0.0, abs=1e-9)
+    assert fit.weights[0] + 2 * fit.weights[4] == pytest.approx(w[0], abs=1e-6)
+    assert "not told apart" in str(fit).splitlines()[3]
+
+
+def test_scale_of_features_does_not_matter_to_what_is_told():
+    mdp, features, w, policy = linear_problem(6)
+    scale = np.array([1e-4, 1.0, 1e3])
+    fit = fit_reward(policy(w), features * scale, mdp=mdp, beta=2.0, exact=True)
+    assert fit.identified.all()
+    assert fit.weights * scale == pytest.approx(w, abs=1e-6)
+
+
+def test_only_the_share_of_actions_in_a_state_enters():
+    """Cut, shuffled, and visited as one likes: the same policy, the same weights; the errors differ."""
+    mdp, features, w, policy = linear_problem(7)
+    often = 1e6 * np.array([1, 2, 3, 4, 5, 6.0])[:, None] * policy(w)
+    rare = 1e6 * np.array([6, 5, 4, 3, 2, 1.0])[:, None] * policy(w)
+    fits = [fit_reward(counts, features, mdp=mdp, beta=2.0) for counts in (often, rare)]
+    assert fits[0].weights == pytest.approx(fits[1].weights, abs=1e-5)
+    assert not np.allclose(fits[0].standard_error, fits[1].standard_error, rtol=0.01)
+
+
+def test_missing_actions_and_states_never_seen():
+    """Pair (2, 1) does not exist; nobody was seen in state 5, where the prior stands for the expert."""
+    mdp, features, w, _ = linear_problem(8)
+    allowed = np.ones((6, 3), bool)
+    allowed[2, 1] = False
+    mdp = TabularMDP(mdp.transition, features @ w, mdp.start, allowed=allowed)
+    expert = solve_soft_bellman(mdp, 2.0).policy.numpy()
+    data = collect(mdp, 1, 3000, 0, expert)
+    fit = fit_reward(data.where(data.s != 5), features, mdp=mdp, beta=2.0)
+    assert np.isfinite(fit.weights).all()
+    assert "in states without a step" in fit.message
+    assert fit.solution.policy[2, 1] == 0
+    whole = fit_reward(data, features, mdp=mdp, beta=2.0)
+    assert np.abs((whole.weights - w) / whole.standard_error).max() < 4
+    with pytest.warns(Note, match="1 of 3,001 tuples are left out"):
+        odd = Transitions(*(np.append(getattr(data, name), x) for name, x in zip(
+            ("s", "a", "r", "s_next", "a_next"), (2, 1, 0.0, 0, 0), strict=True)))  # fmt: skip
+        again = fit_reward(odd, features, mdp=mdp, beta=2.0)
+    assert again.weights == pytest.approx(whole.weights, abs=1e-12)
+    assert fit_reward(expert, mdp=mdp, beta=2.0, exact=True).weights.shape == (17,)
+
+
+def test_counts_in_the_place_of_a_model():
+    mdp, features, w, policy = linear_problem(9)
+    data = collect(mdp, 1, 200_000, 0, policy(w))
+    fit = fit_reward(data, features, mdp=empirical_mdp(data, 6, 3), beta=2.0)
+    assert fit.weights == pytest.approx(w, abs=0.05)
+    known = fit_reward(data, features, mdp=mdp, beta=2.0)
+    assert fit.weights == pytest.approx(known.weights, abs=0.05)
+
+
+def test_penalty_keeps_weights_small():
+    """An expert that always takes action 0: no finite reward makes that optimal."""
+    mdp, features, *_ = linear_problem(10)
+    expert = np.repeat([[1.0, 0.0, 0.0]], 6, axis=0)
+    fits = [fit_reward(expert, mdp=mdp, beta=2.0, exact=True, penalty=x) for x in (1e-2, 1e-4)]
+    assert all(fit.converged for fit in fits)
+    assert np.abs(fits[0].weights).max() < np.abs(fits[1].weights).max() < 100
+    unbounded = fit_reward(expert, mdp=mdp, beta=2.0, exact=True)
+    assert unbounded.converged or "may grow without end" in unbounded.message
+
+
+@pytest.mark.parametrize(
+    ("change", "key"),
+    [
+        (dict(optimism=-0.1), "optimism"),
+        (dict(optimism=np.inf), "optimism"),
+        (dict(beta=-1.0), "beta"),
+        (dict(penalty=-1.0), "penalty"),
+        (dict(pseudo_count=0.0), "pseudo_count"),
+        (dict(features=np.zeros((6, 2, 3))), "features"),
+        (dict(features=np.full((6, 1), np.nan)), "features[0, 0]"),
+        (dict(names=["one"]), "names"),
+        (dict(demonstrations=np.zeros((6, 3))), "demonstrations"),
+        (dict(demonstrations=-np.ones((6, 3))), "demonstrations[0, 0]"),
+        (dict(demonstrations=Transitions([7], [0], [0.0], [0], [0])), "s[0]"),
+        (dict(demonstrations=Transitions([1], [0], [0.0], [0], [0]), exact=True), "exact"),
+        (dict(mdp="cliff"), "mdp"),
+        (dict(mdp=TabularMDP(np.eye(6)[:, None].repeat(3, 1), np.zeros((6, 3)))), "mdp"),
+        (dict(tol=0.0), "tol"),
+        (dict(max_iterations=0), "max_iterations"),
+    ],
+)
+def test_bad_arguments_of_the_fit(change, key):
+    mdp, features, _, _ = linear_problem()
+    with pytest.raises(InputError) as error:
+        fit_reward(**{"demonstrations": np.ones((6, 3)), "features": features, "mdp": mdp, "beta": 2.0} | change)
+    assert error.value.key == key

@@ -54,9 +54,7 @@ class Demonstrated:
         return float(self.flow[self.counts.sum(1) == 0].sum())
 
 
-def setting(
-    mdp: TabularMDP | EmpiricalMDP, beta: float, prior_policy: ArrayLike | None, optimism: float
-) -> Setting:
+def setting(mdp: TabularMDP | EmpiricalMDP, beta: float, prior_policy: ArrayLike | None, optimism: float) -> Setting:
     """The problem of ``mdp`` without its rewards. Raises InputError as ``BellmanProblem.of``."""
     checks.instance("mdp", mdp, (TabularMDP, EmpiricalMDP), "a TabularMDP, or counts as of empirical_mdp")
     if isinstance(mdp, TabularMDP):
@@ -96,6 +94,7 @@ def demonstrated(
         note(f"{lost / total:.3g} of the demonstrations are left out: their pairs take no part in the problem")
     c = 0.0 if exact else pseudo_count
     visits = counts.sum(1, keepdims=True)
-    policy = np.where(visits + c > 0, (counts + c * problem.prior) / np.where(visits + c > 0, visits + c, 1.0), problem.prior)
+    known = visits + c > 0
+    policy = np.where(known, (counts + c * problem.prior) / np.where(known, visits + c, 1.0), problem.prior)
     share = long_run(problem.chain(policy), problem.start).of_state
     return Demonstrated(counts, policy, share[:, None] * policy, c, exact)

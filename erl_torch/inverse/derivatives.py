@@ -1,7 +1,7 @@
 """How the solution moves with the problem: ``Linearised``, the derivatives at a solution, forwards and backwards.
 
-At V + g = TV, with K = sum_a pi* q*, q*(s'|s,a) = p exp(kappa (V(s') - C V(s,a))) and c(s) what TV(s) changes by while V
-stays,
+At V + g = TV, with K = sum_a pi* q*, q*(s'|s,a) = p exp(kappa (V(s') - C V(s,a))) and c(s) what TV(s) changes by while
+V stays,
 
     (I - K) dV + dg = c        d log pi* = d log prior + beta (dr + dC V - dV(s) - dg) + dbeta (r + C V - TV).
 
@@ -98,9 +98,9 @@ class Linearised:
             return np.asarray(np.expm1(kappa * off) / kappa)
 
     def advantages(self, features: np.ndarray) -> np.ndarray:
-        """A = phi + q* Phi - Phi(s) - mean phi of features [n, A, F], with (I - K) Phi + mean = sum_a pi* phi; [n, A, F].
+        """A = phi + q* Phi - Phi(s) - mean of features phi [n, A, F], where (I - K) Phi + mean = sum_a pi* phi.
 
-        d log pi* / dw = beta A, where r is the sum of w times the features.
+        [n, A, F]; d log pi* / dw = beta A, where r is the sum of w times the features.
         """
         n, n_actions, n_features = features.shape
         potential, mean = self.lu.solve((self.policy[:, :, None] * features).sum(1))
@@ -156,7 +156,7 @@ def linearise(problem: BellmanProblem, value: np.ndarray, steps: int = LAST_STEP
         backed_up, policy = _backup(problem, certain)
         chain = problem.chain(policy, tilted)
         lu = RegenerativeLU.adapted(chain, ref, problem.elimination)
-        rate, change = lu.poisson(backed_up - value)
+        _, change = lu.poisson(backed_up - value)
         value = value + change - change.mean()
         if problem.beta * np.ptp(change) < NEAR:
             break

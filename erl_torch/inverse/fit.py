@@ -1,18 +1,18 @@
 """Which reward explains this behaviour? ``fit_reward``, from demonstrations in a known or counted model.
 
-The expert is taken to be optimal for a reward r = sum_k w_k phi_k, as ``solve_soft_bellman`` has it: with policy pi_w and
-rate g_w. At optimism 0 the estimator balances the flow (docs/theory.md, Inverse):
+The expert is taken to be optimal for a reward r = sum_k w_k phi_k, as ``solve_soft_bellman`` has it: with policy pi_w
+and rate g_w. At optimism 0 the estimator balances the flow (docs/theory.md, Inverse):
 
     pi_E(a|s) = (n(s,a) + c prior) / (n(s) + c),  d_E the long-run share of pairs under pi_E,
     maximise    beta (sum d_E r_w - g_w) - penalty |w|^2 / 2.
 
-That is concave, and equals the mean of log(pi_w/prior) over d_E. Only pi_E(a|s) enters: demonstrations may be short, begin
-anywhere and be cut anywhere. Above optimism 0 the mean of log pi_w over the demonstrations is maximised itself; it is
-not concave, and what is found is a local maximum.
+That is concave, and its first term is the mean of log(pi_w/prior) over d_E. Only pi_E(a|s) enters: demonstrations may
+be short, begin anywhere and be cut anywhere. Above optimism 0 the mean of log pi_w over the demonstrations is maximised
+itself; it is not concave, and what is found is a local maximum.
 
-What behaviour cannot tell: w and w + v explain it alike if sum_k v_k phi_k = Phi(s) - E Phi(s') + const (at optimism 0),
+What behaviour cannot tell: at optimism 0, w and w + v explain it alike if sum_k v_k phi_k = Phi(s) - E Phi(s') + const,
 which a table of rewards always allows: of S A entries S A - S are told. The weights returned have no part in such
-directions.
+directions. Above optimism 0 the directions named are those that change nothing to first order.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class RewardFit:
     gap: float  # what pi_E loses by ``reward``: mean KL(pi_E || pi) / beta over its flow, reward per step
     log_likelihood: float  # mean of log(pi/prior) over the demonstrations, nats per step
     n_steps: float  # demonstrated; infinite where the policy was exact
-    converged: bool  # the gradient per step, times 1/beta, is at most ``tol`` times the size of the features
+    converged: bool  # the flows of features differ by ``tol`` of each feature's size at most, the penalty counted
     message: str
     names: tuple[str, ...]
 
@@ -99,16 +99,17 @@ def fit_reward(
 
     Args:
         demonstrations: tuples, of which s and a count (their order, rewards and a' do not); or a table [S, A] of counts
-            n(s, a), or with ``exact`` of a policy, a distribution over pairs, or anything with their proportions in a row.
+            n(s, a), or with ``exact`` of a policy, or of shares of pairs: proportions within a row are the policy.
         features: [S, A, F], or [S, F] of the state alone; None: each pair is one, the reward is a table.
-        mdp: the model, whose rewards are ignored; or counts of tuples, as of ``empirical_mdp``, of the expert's or others.
+        mdp: the model, whose rewards are ignored; or counts of tuples, the expert's or others', as of
+            ``empirical_mdp``.
         beta: inverse temperature of the expert, 1/reward. Only beta times the reward is told.
         prior_policy: [S, A], 0 where an action is not to be taken; None is uniform over the actions of each state.
         penalty: >= 0, 1/reward^2, of |w|^2 / 2, taken from the log-likelihood of one step.
         pseudo_count: > 0, steps of the prior that are added to those of each state.
         exact: the table is the expert's policy itself, of infinitely many steps.
         names: [F], of the features; None: numbers, or pairs.
-        tol: of the gradient.
+        tol: of the gradient: difference of mean features, each in units of its largest value.
         max_iterations: of L-BFGS.
         optimism: of the expert, >= 0.
 
@@ -200,23 +201,26 @@ def _reward(features: ArrayLike | None, given: Setting, table: np.ndarray, weigh
 
 
 class _Objective:
-    """The log-likelihood of one step less the penalty, of weights times beta, x [F], with its derivatives."""
+    """The log-likelihood of one step less the penalty, with its derivatives, as a function of x [F]: weights times beta
+    times ``scale``, the size of each feature."""
 
     def __init__(self, given: Setting, expert: Demonstrated, features: np.ndarray, penalty: float) -> None:
-        self.given, self.base = given, given.problem
-        self.expert, self.features, self.penalty = expert, features, penalty
-        self._aim = features.T @ expert.flow.ravel()
+        self.given, self.base, self.expert, self.penalty = given, given.problem, expert, penalty
+        self.scale = np.abs(features).max(0)
+        self.scale[self.scale == 0] = 1.0
+        self.features = features / self.scale
+        self.stiffness = penalty / (self.base.beta * self.scale) ** 2
+        self._aim = self.features.T @ expert.flow.ravel()
         self._value: np.ndarray | None = None
 
-    @property
-    def size(self) -> float:
-        """The largest feature, which its gradient is compared with."""
-        return float(np.abs(self.features).max()) or 1.0
+    def weights(self, x: np.ndarray) -> np.ndarray:
+        return np.asarray(x / (self.base.beta * self.scale))
 
     def problem(self, weights: np.ndarray) -> BellmanProblem:
         """With the reward of ``weights`` [F]."""
         base = self.base
-        problem = replace(base, reward=base.reward + (self.features @ weights).reshape(base.reward.shape))
+        reward = (self.features @ (self.scale * weights)).reshape(base.reward.shape)
+        problem = replace(base, reward=base.reward + reward)
         for name in SHARED:
             problem.__dict__[name] = getattr(base, name)
         return problem
@@ -226,7 +230,7 @@ class _Objective:
 
     def at(self, x: np.ndarray) -> Linearised | None:
         """The solution; None where there is none in double precision."""
-        problem = self.problem(x / self.base.beta)
+        problem = self.problem(self.weights(x))
         if not np.isfinite(problem.reward).all():
             return None
         for value in (self._value, None):
@@ -258,13 +262,11 @@ class _Objective:
         else:
             none = np.zeros(len(at.value))
             gradient = self.features.T @ at.backward(none, 0.0, expert.weight).pair.ravel() / beta
-        rate = self.penalty / beta**2
-        return mean - rate * float(x @ x) / 2, gradient - rate * x
+        return mean - float(self.stiffness @ x**2) / 2, gradient - self.stiffness * x
 
 
 def _maximise(objective: _Objective, tol: float, max_iterations: int) -> tuple[np.ndarray, Linearised, bool]:
     """(weights [F], the solution there, whether the gradient is small): L-BFGS, then scoring steps."""
-    beta, small = objective.base.beta, tol * objective.size
     n_features = objective.features.shape[1]
 
     def loss(x: np.ndarray) -> tuple[float, np.ndarray]:
@@ -279,28 +281,26 @@ def _maximise(objective: _Objective, tol: float, max_iterations: int) -> tuple[n
         why = objective.solve(objective.problem(x))
         allowed = f"a model that solve_soft_bellman solves ({why.message or why.status.value})"
         raise InputError("mdp", f"a model whose solution is {why.status.name}", allowed)
-    options = {"maxiter": max_iterations, "maxfun": 4 * max_iterations, "ftol": 1e-13, "gtol": small, "maxcor": 20}
+    options = {"maxiter": max_iterations, "maxfun": 4 * max_iterations, "ftol": 1e-13, "gtol": tol, "maxcor": 20}
     x = minimize(loss, x, jac=True, method="L-BFGS-B", options=options).x
     at = objective.at(x)
     assert at is not None
     value, gradient = objective.evaluate(x, at)
     for _ in range(SCORING_STEPS):
-        if np.abs(gradient).max() <= 1e-3 * small:
+        if np.abs(gradient).max() <= 1e-3 * tol:
             break
         better = _scored(objective, x, at, value, gradient)
         if better is None:
             break
         x, at, value, gradient = better
-    return x / beta, at, bool(np.abs(gradient).max() <= small)
+    return objective.weights(x), at, bool(np.abs(gradient).max() <= tol)
 
 
 def _scored(
     objective: _Objective, x: np.ndarray, at: Linearised, value: float, gradient: np.ndarray
 ) -> tuple[np.ndarray, Linearised, float, np.ndarray] | None:
     """(x, solution, objective, gradient) after a step along the inverse information; None where no part of it helps."""
-    beta = objective.base.beta
-    information = _squares(at, _advantages(objective, at), objective.share(at))
-    information += np.eye(len(x)) * objective.penalty / beta**2
+    information = _squares(at, _advantages(objective, at), objective.share(at)) + np.diag(objective.stiffness)
     sizes, axes = np.linalg.eigh(information)
     kept = sizes > SMALL * max(sizes[-1], 0.0)
     step = axes[:, kept] @ ((axes[:, kept].T @ gradient) / sizes[kept])
@@ -317,7 +317,7 @@ def _scored(
 
 
 def _advantages(objective: _Objective, at: Linearised) -> np.ndarray:
-    """Those of the features, [n*A, F]."""
+    """Those of the features, divided by their sizes, [n*A, F]."""
     n, n_actions = at.policy.shape
     return at.advantages(objective.features.reshape(n, n_actions, -1)).reshape(n * n_actions, -1)
 
@@ -330,19 +330,15 @@ def _squares(at: Linearised, advantages: np.ndarray, share: np.ndarray) -> np.nd
 
 def _directions(objective: _Objective, at: Linearised) -> tuple[np.ndarray, np.ndarray]:
     """Orthonormal columns of the directions of the weights [F] that behaviour tells, and of those that it does not."""
-    scale = np.abs(objective.features).max(0)
-    scale[scale == 0] = 1.0
-    scaled = _advantages(objective, at)[objective.base.prior.ravel() > 0] / scale
+    scaled = _advantages(objective, at)[objective.base.prior.ravel() > 0]
     n_pairs, n_features = scaled.shape
     _, sizes, axes = np.linalg.svd(scaled, full_matrices=n_features > n_pairs)
     rank = int((sizes > max(TOLD * sizes[0], 1e-300)).sum())
-    whole = np.linalg.qr((axes[rank:] / scale).T, mode="complete")[0]
+    whole = np.linalg.qr((axes[rank:] / objective.scale).T, mode="complete")[0]
     return whole[:, n_features - rank :], whole[:, : n_features - rank]
 
 
-def _information(
-    objective: _Objective, at: Linearised, told: np.ndarray
-) -> tuple[np.ndarray, np.ndarray | None]:
+def _information(objective: _Objective, at: Linearised, told: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
     """(eigenvalues of a step's information about the directions ``told``, standard errors of the weights [F]).
 
     With h the weight of a state in the objective, its second derivative is -H, H = beta^2 sum_s h E A A', and the
@@ -351,7 +347,7 @@ def _information(
     """
     expert, beta = objective.expert, objective.base.beta
     share = objective.share(at)
-    advantages = beta * _advantages(objective, at) @ told
+    advantages = beta * (_advantages(objective, at) * objective.scale) @ told
     sizes, axes = np.linalg.eigh(_squares(at, advantages, share))
     if expert.exact:
         return sizes, None
@@ -371,7 +367,7 @@ def _divergence(policy: np.ndarray, at: Linearised) -> np.ndarray:
     prior = at.problem.prior
     ratio = policy / np.where(prior > 0, prior, 1.0)
     terms = np.where(policy > 0, policy * (np.log(np.where(policy > 0, ratio, 1.0)) - at.log_ratio), 0.0)
-    return np.maximum(terms.sum(1), 0.0)
+    return np.asarray(np.maximum(terms.sum(1), 0.0))
 
 
 def _message(
