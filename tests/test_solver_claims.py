@@ -13,6 +13,7 @@ from many_digits import problem
 from erl_torch import InputError, Status, TabularMDP, certify, iterate_biasing, solve_biasing, solve_soft_bellman
 from erl_torch.solvers import soft_bellman
 from erl_torch.solvers.biasing import PATIENCE
+from erl_torch.solvers.horizons import Backup
 from erl_torch.solvers.newton import NewtonPattern
 from erl_torch.solvers.problem import BellmanProblem
 from erl_torch.solvers.result import exact_solution
@@ -213,13 +214,11 @@ def test_the_state_with_the_narrowest_bounds_is_kept(monkeypatch):
     problem = BellmanProblem.of(mdp, 5.0)
     good = solve_soft_bellman(mdp, 5.0)
     value = good.value.numpy()
-    states = [
-        soft_bellman._state(problem, v, i + 1, np.inf) for i, v in enumerate((0.9 * value, value + 1.0, 0 * value))
-    ]
+    states = [Backup(problem).state(v, i + 1, np.inf) for i, v in enumerate((0.9 * value, value + 1.0, 0 * value))]
     monkeypatch.setattr(soft_bellman, "iterate_soft_bellman", lambda *_: iter(states))
     found = soft_bellman.solve_problem(problem, mdp)
     np.testing.assert_allclose(found.policy, good.policy, atol=1e-9)
-    monkeypatch.setattr(soft_bellman, "_undiscounted", lambda *_: iter(states))
+    monkeypatch.setattr(soft_bellman, "undiscounted", lambda *_: iter(states))
     kept, bounds = soft_bellman.polish(problem, np.zeros(4), (-np.inf, np.inf), 1e-300)
     np.testing.assert_array_equal(kept, states[1].value)
     assert bounds[1] - bounds[0] <= states[1].width

@@ -22,9 +22,10 @@ from erl_torch.mdp.tabular import TabularMDP, check_prior
 from erl_torch.problem import Problem
 from erl_torch.solution import Solution, Status, proven
 from erl_torch.solvers.biasing import KL_TOLERANCE, BiasingState, iterate_biasing, solve_biasing
+from erl_torch.solvers.horizons import BellmanState
 from erl_torch.solvers.problem import BellmanProblem
 from erl_torch.solvers.result import bias, ended, reducible_solution, spread
-from erl_torch.solvers.soft_bellman import BellmanState, iterate_soft_bellman, polish, solve_soft_bellman
+from erl_torch.solvers.soft_bellman import iterate_soft_bellman, polish, solve_soft_bellman
 
 
 @dataclass(frozen=True, eq=False)
