@@ -232,8 +232,8 @@ def page(parts: dict[str, Any]) -> str:
             "## Beside the tabular MCE IRL of `imitation`",
             "",
             "Windy cliff, the same 10 episodes of 1,000 steps, a reward for each state, one run on one machine. MCE "
-            "IRL has the episodes' horizon, 1,000, a linear reward, and Adam; .01 is its default. Loss: of the policy that "
-            "is best for its reward in the endless problem, and of the policy of its own first step.",
+            "IRL has the episodes' horizon, 1,000, a linear reward, and Adam; .01 is its default. Loss: of the policy "
+            "that is best for its reward in the endless problem, and of the policy of its own first step.",
             "",
             "| by | seed | loss | own policy's | seconds | times ours |",
             "|---|---|---|---|---|---|",

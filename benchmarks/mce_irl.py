@@ -31,9 +31,7 @@ def main() -> None:
         horizon=horizon,
         initial_state_dist=given["start"],
     )
-    shares = np.bincount(episodes.ravel(), minlength=n_states) / len(
-        episodes
-    )  # as it counts states
+    shares = np.bincount(episodes.ravel(), minlength=n_states) / len(episodes)  # as it counts states
     torch.manual_seed(0)
     net = reward_nets.BasicRewardNet(
         env.observation_space,

@@ -59,7 +59,8 @@ def random_problem(seed, n_states=4, n_actions=3):
 @pytest.mark.parametrize("optimism", OPTIMISM)
 def test_function_solves_the_equation(optimism):
     r, p, prior = random_problem(1)
-    theta, value, log_policy = soft_bellman(*tensors(r, p, prior), beta=2.0, optimism=optimism)
+    x, y, z = tensors(r, p, prior)
+    theta, value, log_policy = soft_bellman(x, y, z, 2.0, optimism=optimism)
     v, g = relative_value(p, r, prior, 2.0, optimism)
     assert theta.item() == pytest.approx(-g, abs=1e-12)
     assert value.detach().numpy() == pytest.approx(v, abs=1e-11)
@@ -292,8 +293,8 @@ def test_weights_are_found_again(optimism):
 
 
 def test_objective_is_concave_and_is_the_likelihood_of_the_flow():
-    """l(w) = beta (<d_E, r_w> - g_w) by the test's own solver: the fit is its maximum, and along lines it is concave."""
-    mdp, features, w, policy = linear_problem(1)
+    """l(w) = beta (<d_E, r_w> - g_w) by the test's own solver: the fit is its maximum, and it is concave along lines."""
+    mdp, features, _, policy = linear_problem(1)
     rng, prior = np.random.default_rng(1), np.full((6, 3), 1 / 3)
     p, expert = mdp.transition.toarray().reshape(6, 3, 6), rng.dirichlet(np.ones(3), size=6)  # no expert of any w
     share = stationary(np.einsum("sa,sat->st", expert, p))[:, None] * expert
@@ -409,9 +410,14 @@ def test_missing_actions_and_states_never_seen():
     assert fit.solution.policy[2, 1] == 0
     whole = fit_reward(data, features, mdp=mdp, beta=2.0)
     assert np.abs((whole.weights - w) / whole.standard_error).max() < 4
+    odd = Transitions(
+        np.append(data.s, 2),
+        np.append(data.a, 1),
+        np.append(data.r, 0.0),
+        np.append(data.s_next, 0),
+        np.append(data.a_next, 0),
+    )
     with pytest.warns(Note, match="1 of 3,001 tuples are left out"):
-        odd = Transitions(*(np.append(getattr(data, name), x) for name, x in zip(
-            ("s", "a", "r", "s_next", "a_next"), (2, 1, 0.0, 0, 0), strict=True)))  # fmt: skip
         again = fit_reward(odd, features, mdp=mdp, beta=2.0)
     assert again.weights == pytest.approx(whole.weights, abs=1e-12)
     assert fit_reward(expert, mdp=mdp, beta=2.0, exact=True).weights.shape == (17,)
@@ -428,7 +434,7 @@ def test_counts_in_the_place_of_a_model():
 
 def test_penalty_keeps_weights_small():
     """An expert that always takes action 0: no finite reward makes that optimal."""
-    mdp, features, *_ = linear_problem(10)
+    mdp = linear_problem(10)[0]
     expert = np.repeat([[1.0, 0.0, 0.0]], 6, axis=0)
     fits = [fit_reward(expert, mdp=mdp, beta=2.0, exact=True, penalty=x) for x in (1e-2, 1e-4)]
     assert all(fit.converged for fit in fits)

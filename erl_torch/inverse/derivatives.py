@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
+from scipy.special import xlog1py
 
 from erl_torch.solvers.certificates import soft_backup
 from erl_torch.solvers.chains import RegenerativeLU, SingularChainError
@@ -137,7 +138,7 @@ class Linearised:
             near = np.where(small, x, 0.0)
             series = near**2 * (1 / 2 - near / 6 + near**2 / 12 - near**3 / 20)
             far = np.where(small, 0.0, x)
-            terms = np.where(small, series, (1 + far) * np.log1p(far) - far)
+            terms = np.where(small, series, xlog1py(1 + far, far) - far)
         return np.bincount(rows, p.data * terms, p.shape[0]) / kappa**2
 
 
@@ -152,7 +153,7 @@ def linearise(problem: BellmanProblem, value: np.ndarray, steps: int = LAST_STEP
         raise SingularChainError("several closed classes")
     value = value - value.mean()
     for _ in range(steps):
-        certain, tilted = _ahead(problem, value)
+        certain, tilted = problem.certainty_equivalent(value), problem.tilted(value)
         backed_up, policy = _backup(problem, certain)
         chain = problem.chain(policy, tilted)
         lu = RegenerativeLU.adapted(chain, ref, problem.elimination)
@@ -161,7 +162,7 @@ def linearise(problem: BellmanProblem, value: np.ndarray, steps: int = LAST_STEP
         if problem.beta * np.ptp(change) < NEAR:
             break
     share = lu.stationary()
-    certain, tilted = _ahead(problem, value)
+    certain, tilted = problem.certainty_equivalent(value), problem.tilted(value)
     backed_up, policy = _backup(problem, certain)
     q = problem.reward + certain.reshape(policy.shape)
     p = problem.transition
@@ -177,14 +178,6 @@ def linearise(problem: BellmanProblem, value: np.ndarray, steps: int = LAST_STEP
         share=share,
         width=float(np.ptp(backed_up - value)),
     )
-
-
-def _ahead(problem: BellmanProblem, value: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-    """(C V [n*A], q* as CSR data; None: p)."""
-    if problem.kappa == 0:
-        return np.asarray(problem.transition @ value), None
-    log_mean, _, tilted = problem.tilt(problem.kappa * value)
-    return log_mean / problem.kappa, tilted
 
 
 def _backup(problem: BellmanProblem, certain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -125,7 +125,7 @@ class _Solved(torch.autograd.Function):
         return torch.tensor(-at.rate, dtype=torch.float64), torch.from_numpy(value), torch.from_numpy(log_policy)
 
     @staticmethod
-    @once_differentiable  # type: ignore[untyped-decorator]
+    @once_differentiable
     def backward(ctx: Any, by_theta: torch.Tensor, by_value: torch.Tensor, by_log_policy: torch.Tensor) -> Any:
         at: Linearised = ctx.at
         prior = at.problem.prior
