@@ -18,6 +18,9 @@ place of that (``joint``), the certainty equivalent being (1/kappa) log <exp(kap
 pair, kappa = optimism * beta: S1's listing at optimism 1. That is the problem of other frequencies and rewards,
 
     p'(s'|s,a) ~ n(s,a,s') <exp(kappa r)>(s,a,s'),    r'(s,a) = (1/kappa) log <exp(kappa r)>(s,a).
+
+Tuples with weights w count for w each: with W(s,a,s') their sum, the frequencies are W(s,a,s')/W(s,a), and means are
+sums of w x over sums of w: the model of other dynamics p^ ~ w p. Tuples of weight 0 are left out.
 """
 
 from __future__ import annotations
@@ -31,7 +34,7 @@ from numpy.typing import ArrayLike
 from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.empirical import kernels
-from erl_torch.experience.experience import EXPERIENCE, Experience
+from erl_torch.experience.experience import EXPERIENCE, Experience, is_weighted, weighing
 from erl_torch.mdp.tabular import check_prior, normalise_rows
 from erl_torch.solvers.chains import classes
 from erl_torch.solvers.problem import BellmanProblem
@@ -41,14 +44,26 @@ BLOCK = 1 << 16  # tuples at a time: they stay in the processor's cache
 
 
 @dataclass(frozen=True, eq=False)
+class WeightSums:
+    """What the weights w of the tuples of each (s,a,s') come to, [nnz] each; entries as in ``transition``."""
+
+    total: np.ndarray  # sum of w
+    squares: np.ndarray  # sum of w^2
+    off: np.ndarray  # sum of w^2 (r - mean r given s')
+    off_squares: np.ndarray  # sum of w^2 (r - mean r given s')^2
+
+
+@dataclass(frozen=True, eq=False)
 class EmpiricalMDP:
     """Sufficient statistics of a stream: S*A and nnz numbers, for a stream of any length."""
 
-    visits: np.ndarray  # n(s,a), [S, A] int64
+    visits: np.ndarray  # n(s,a), [S, A] int64; tuples of weight 0 excepted
     transition: sp.csr_array  # n(s,a,s')/n(s,a), [S*A, S]; rows without visits are empty
     reward: np.ndarray  # mean, [S, A]; 0 without visits
     reward_variance: np.ndarray  # of one reward, [S, A], divisor n-1; 0 below two visits
     reward_given_next: np.ndarray  # mean reward of (s,a,s'), [nnz], entries as in `transition`
+    weights: WeightSums | None = None  # of tuples with weights
+    given: bool = False  # `transition` is known, and only the rewards are of the stream (erl_torch.empirical.dynamics)
 
     @property
     def n_states(self) -> int:
@@ -222,13 +237,19 @@ def empirical_mdp(data: Experience, n_states: int, n_actions: int, counted: Tall
     """Counts and mean rewards of a stream: one pass over it, and two more where rewards vary.
 
     Args:
-        data: the tuples; a' is not used.
+        data: the tuples; a' is not used. Weights count, as the module's docstring says.
         n_states, n_actions: sizes of the tables.
         counted: the tally of the stream, where the caller has it.
 
     Raises:
-        InputError: naming the first tuple with a state or action out of range.
+        InputError: naming the first tuple with a state or action out of range, or a pair all of whose tuples have
+            weight 0.
     """
+    checks.instance("transitions", data, Experience, EXPERIENCE)
+    if is_weighted(data):
+        data = weighing(data, n_states, n_actions)
+        if is_weighted(data):
+            return _weighted(data, n_states, n_actions)
     counted = counted or tally(data, n_states, n_actions)
     visits, base = counted.visits, counted.last_reward
     n = np.maximum(visits, 1)
@@ -259,6 +280,57 @@ def empirical_mdp(data: Experience, n_states: int, n_actions: int, counted: Tall
     )
 
 
+def entries_of(model: EmpiricalMDP, s: np.ndarray, a: np.ndarray, s_next: np.ndarray) -> np.ndarray:
+    """[N], the entry of ``model.transition`` that each (s,a,s') is of; its rows are sorted, and it has them all."""
+    p, n_states = model.transition, np.int64(model.n_states)
+    keys = np.repeat(np.arange(p.shape[0]), np.diff(p.indptr)) * n_states + p.indices
+    return np.asarray(np.searchsorted(keys, (s * np.int32(model.n_actions) + a) * n_states + s_next))
+
+
+def _weighted(data: Experience, n_states: int, n_actions: int) -> EmpiricalMDP:
+    """``empirical_mdp`` of tuples with weights above 0: three passes."""
+    seen = tally(data, n_states, n_actions)
+    n_pairs, nnz, base = len(seen.visits), len(seen.counts), seen.last_reward
+    row = np.repeat(np.arange(n_pairs), np.diff(seen.indptr))
+    plain = EmpiricalMDP(
+        visits=seen.visits.reshape(n_states, n_actions),
+        transition=sp.csr_array((np.ones(nnz), seen.indices, seen.indptr), shape=(n_pairs, n_states)),
+        reward=np.zeros((n_states, n_actions)),
+        reward_variance=np.zeros((n_states, n_actions)),
+        reward_given_next=np.zeros(nnz),
+    )
+    total, squares, off, square_off, spread, square_spread = np.zeros((6, nnz))
+    for chunk in data.chunks():
+        assert chunk.weight is not None
+        entry, w = entries_of(plain, chunk.s, chunk.a, chunk.s_next), chunk.weight
+        np.add.at(total, entry, w)
+        np.add.at(squares, entry, w**2)
+        np.add.at(off, entry, w * (chunk.r - base[row[entry]]))
+    of_pair = np.bincount(row, total, n_pairs)
+    some = np.maximum(of_pair, np.finfo(float).tiny)
+    reward = base + np.bincount(row, off, n_pairs) / some
+    given = base[row] + off / total
+    with np.errstate(over="ignore", invalid="ignore"):
+        for chunk in data.chunks():
+            assert chunk.weight is not None
+            entry, w = entries_of(plain, chunk.s, chunk.a, chunk.s_next), chunk.weight
+            np.add.at(spread, entry, w * (chunk.r - reward[row[entry]]) ** 2)
+            np.add.at(square_off, entry, w**2 * (chunk.r - given[entry]))
+            np.add.at(square_spread, entry, w**2 * (chunk.r - given[entry]) ** 2)
+    if not all(np.isfinite(x).all() for x in (total, squares, spread, square_spread)):
+        raise InputError("weight", "weights and rewards", "of a size whose squares are finite numbers")
+    n = np.maximum(seen.visits, 1)
+    variance = np.where(n > 1, np.bincount(row, spread, n_pairs) / some * n / np.maximum(n - 1, 1), 0.0)
+    return replace(
+        plain,
+        transition=sp.csr_array((total / of_pair[row], seen.indices, seen.indptr), shape=(n_pairs, n_states)),
+        reward=reward.reshape(n_states, n_actions),
+        reward_variance=variance.reshape(n_states, n_actions),
+        reward_given_next=given,
+        weights=WeightSums(total, squares, square_off, square_spread),
+    )
+
+
 def joint(model: EmpiricalMDP, data: Experience, kappa: float) -> EmpiricalMDP:
     """``model``, of the stream ``data``, with rewards that count together with s': the module's docstring.
 
@@ -273,19 +345,23 @@ def joint(model: EmpiricalMDP, data: Experience, kappa: float) -> EmpiricalMDP:
     varied = np.asarray(model.reward_variance.ravel() > 0)
     if kappa == 0 or not varied.any():
         return model
-    p, n_states, n_actions = model.transition, np.int64(model.n_states), np.int32(model.n_actions)
+    data = weighing(data, model.n_states, model.n_actions)
+    p = model.transition
     row = np.repeat(np.arange(p.shape[0]), np.diff(p.indptr))
-    keys = row * n_states + p.indices
     largest, total = np.full(p.nnz, -np.inf), np.zeros(p.nnz)
     for sums in (False, True):
         for chunk in data.chunks():
-            entry = np.searchsorted(keys, (chunk.s * n_actions + chunk.a) * n_states + chunk.s_next)
+            entry, weight = (
+                entries_of(model, chunk.s, chunk.a, chunk.s_next),
+                1.0 if chunk.weight is None else chunk.weight,
+            )
             if sums:
-                np.add.at(total, entry, np.exp(kappa * chunk.r - largest[entry]))
+                np.add.at(total, entry, weight * np.exp(kappa * chunk.r - largest[entry]))
             else:
                 np.maximum.at(largest, entry, kappa * chunk.r)
     first = p.indptr[:-1][np.diff(p.indptr) > 0]
-    log_share = largest + np.log(total / model.visits.ravel()[row])
+    visits = model.visits.ravel() if model.weights is None else np.bincount(row, model.weights.total, p.shape[0])
+    log_share = largest + np.log(total / visits[row])
     log_mean = np.zeros(p.shape[0])
     log_mean[row[first]] = np.logaddexp.reduceat(log_share, first)
     # A share that underflows stays a successor.

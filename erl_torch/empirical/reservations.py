@@ -251,7 +251,9 @@ def of_model(
 
     Of actions that are not to be taken (prior 0) give ``mdp.restricted``: then they need not be met.
     """
-    contradictions = [*_transitions(counted.tally, mdp, counted.names), *_rewards(counted, mdp)]
+    weighted = counted.model is not None and counted.model.weights is not None  # the tuples are of other dynamics
+    contradictions = [] if weighted else [*_transitions(counted.tally, mdp, counted.names)]
+    contradictions += _rewards(counted, mdp)
     if estimate is not None and bounds is not None and _covered(counted.tally, mdp):
         contradictions += _theta(estimate, bounds)
     if not contradictions:

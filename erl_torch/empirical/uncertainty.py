@@ -41,6 +41,15 @@ V(s') stands xi = exp(kappa (V(s') - C V)) / kappa: Var_p(xi) = chi^2(q || p) / 
 matters where max q/p is above sqrt(n): what the data say of it rests on a handful of tuples. A successor that was never
 seen shows at no optimism.
 
+Tuples with weights w: where Var / n stands above, the interval has the sandwich
+
+    v(s,a) = sum_i w_i^2 (x_i - mean x)^2 / (sum_i w_i)^2,    x = r + V(s') (or r + xi), mean x = sum w x / sum w
+
+(first order: a ratio of means), times n/(n - 1) for n = Var(x)/v, Var with weights: as many draws from p^ itself would
+tell as much of x, and n stands for the visits in the likelihood and the second order. Kish's effective sample size
+(sum w)^2 / sum w^2 is that n only where w says nothing of (x - mean x)^2; it serves a ``warning`` where it is small.
+Where the dynamics are given (``erl_torch.empirical.dynamics``) no term of p is in the interval: the rewards alone err.
+
 The bootstrap draws n(s,a) successors anew for every pair (multinomial; the reward's mean with the noise left at a given
 successor), and solves each model. It includes the second order, and subtracts nothing.
 """
@@ -61,7 +70,7 @@ from scipy import optimize, special
 from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.empirical import kernels
-from erl_torch.empirical.counts import EmpiricalMDP, EmpiricalProblem
+from erl_torch.empirical.counts import EmpiricalMDP, EmpiricalProblem, WeightSums
 from erl_torch.mdp.tabular import check_policy
 from erl_torch.solution import Status
 from erl_torch.solvers.certificates import soft_backup
@@ -85,6 +94,7 @@ TIED = 2.0  # standard errors between two actions' values, up to which either ma
 SMALLEST_SHARE = 1e-3  # of a Newton step
 STALLED = 0.5  # a step that leaves more of the width is the last
 UNSOLVED = 1e-6  # width, of the range of the rewards, of a relative value that is none
+FEW_EFFECTIVE = 30.0  # draws: a smaller effective sample size of a pair that matters is told
 COMMON = 0.5  # share of the states; a successor met from more of them may be met from any
 
 
@@ -259,6 +269,8 @@ def bootstrap_theta(
         InputError: an argument out of range, or fewer than two samples that can be solved.
     """
     _check_model(model)
+    if model.weights is not None or model.given:
+        raise InputError("model", "counts with weights, or with dynamics that are given", "plain counts in a bootstrap")
     seed = checks.seed("seed", seed)
     checks.at_least("n_resamples", n_resamples, 2)
     rng = np.random.default_rng(seed)
@@ -326,9 +338,9 @@ def _plug_in(
         freedom=1 / unsure if unsure > 0 else np.inf,
         bias=bias,
         untried=(0.0, untried),
-        smallest_visits=int(model.visits.flat[counts].min()) if counts.size else None,
+        smallest_visits=int(_effective(model).flat[counts].min()) if counts.size else None,
         withheld=_same_reward(model, empirical) or _withheld(total, bias, untried),
-        warning=_warning(model, rows, counts),
+        warning="; ".join(filter(None, (_warning(model, rows, counts), _few_effective(model, counts)))),
     )
     if estimate.withheld:  # the correction cannot be trusted
         return replace(estimate, value=here.gain, bias=0.0)
@@ -426,6 +438,8 @@ class _Rows(NamedTuple):
     variance: np.ndarray  # of x; divisor n - 1, as that of noise
     ratio: np.ndarray  # q/p, [nnz]; 1 at optimism 0
 
+    # Of tuples with weights, n is the number of draws without that would tell as much of x.
+
 
 def _rows(model: EmpiricalMDP, empirical: EmpiricalProblem, here: _Worth) -> _Rows:
     p, shape = model.transition, model.visits.shape
@@ -447,6 +461,11 @@ def _rows(model: EmpiricalMDP, empirical: EmpiricalProblem, here: _Worth) -> _Ro
         ratio, effect = np.exp(exponent), np.expm1(exponent) / problem.kappa
     x = model.reward_given_next + effect
     x = x - np.bincount(rows, share * x, model.visits.size)[rows]
+    if model.given:
+        x = np.zeros_like(x)
+    if model.weights is not None:
+        spread = np.bincount(rows, share * x**2, model.visits.size) + _within(model, share, rows)
+        n = _as_many(model.weights, kept > 0, rows, x, spread)
     unbiased = np.where(n > 1.5, n / np.maximum(n - 1, 1), 1.0)
     noise = _within(model, share, rows) * unbiased
     variance = np.bincount(rows, share * x**2, model.visits.size) * unbiased + noise
@@ -488,6 +507,7 @@ def _furthest(
         d = now.d.ravel()
         x = given + _effect(problem, now, p.indices, row)
         x = x - np.add.reduceat(p.data * x, p.indptr[:-1])[row]
+        x = np.zeros_like(x) if model.given else x
         if tied:
             steps, weights, weighed = steps + 1, weights + d, weighed + d[row] * x
         if idle:
@@ -622,7 +642,7 @@ def _second_order(
     place[states] = np.arange(n)
     weight = np.zeros(model.visits.shape)
     weight[states] = d[:, None] * policy**2
-    entry = (rows.share > 0) & measured.ravel()[pair]
+    entry = (rows.share > 0) & measured.ravel()[pair] & (not model.given)
     together = (weight / draws).ravel()[pair[entry]] * (rows.share * rows.x)[entry]
     at = place[pair[entry] // n_actions], place[p.indices[entry]]
     moved, kappa = 0.0, problem.kappa
@@ -676,8 +696,50 @@ def _by_state(table: np.ndarray) -> sp.csr_array:
     return sp.csr_array((table.ravel(), np.arange(table.size), ends))
 
 
+def _as_many(weights: WeightSums, kept: np.ndarray, rows: np.ndarray, x: np.ndarray, spread: np.ndarray) -> np.ndarray:
+    """``spread`` [S*A], the variance of r + V(s') (divisor n), over the sandwich v(s,a): the draws that tell as much.
+
+    Kish's effective sample size where nothing varies. ``kept`` [nnz]: entries that lead to states in the problem; ``x``
+    [nnz]: mean of r + V(s') given s', less that of the row.
+    """
+    total = np.bincount(rows, weights.total * kept, len(spread))
+    squares = weights.squares * x**2 + 2 * x * weights.off + weights.off_squares
+    meat = np.bincount(rows, squares * kept, len(spread))
+    kish = total**2 / np.maximum(np.bincount(rows, weights.squares * kept, len(spread)), np.finfo(float).tiny)
+    varies = (meat > 0) & (spread > 0)
+    return np.where(varies, spread * total**2 / np.where(varies, meat, 1.0), kish)
+
+
+def _effective(model: EmpiricalMDP) -> np.ndarray:
+    """Kish's effective sample size of each pair, [S, A]; its visits where there are no weights."""
+    if model.weights is None:
+        return model.visits
+    rows = np.repeat(np.arange(model.visits.size), np.diff(model.transition.indptr))
+    total, squares = (np.bincount(rows, x, model.visits.size) for x in (model.weights.total, model.weights.squares))
+    return np.asarray(np.divide(total**2, squares, out=np.zeros_like(total), where=squares > 0)).reshape(
+        model.visits.shape
+    )
+
+
+def _few_effective(model: EmpiricalMDP, counts: np.ndarray) -> str:
+    """That the weights of a pair among ``counts`` (of [S*A]) leave few effective draws; "" if not."""
+    if model.weights is None or not counts.size:
+        return ""
+    effective = _effective(model).ravel()
+    worst = int(counts[np.argmin(effective[counts])])
+    if effective[worst] >= FEW_EFFECTIVE:
+        return ""
+    s, a = divmod(worst, model.n_actions)
+    return (
+        f"at state {s}, action {a} the weights leave an effective sample of {effective[worst]:.3g} of "
+        f"{model.visits.flat[worst]} tuples: the other dynamics go where these tuples seldom do"
+    )
+
+
 def _warning(model: EmpiricalMDP, rows: _Rows, counts: np.ndarray) -> str:
     """That a pair among ``counts`` (of [S*A]) has a successor of whose weight q/p few tuples tell; "" if none has."""
+    if model.given:
+        return ""
     p = model.transition
     pair = np.repeat(np.arange(model.visits.size), np.diff(p.indptr))
     ratio = np.where((rows.share > 0) & np.isin(pair, counts), rows.ratio, 0.0)
@@ -735,6 +797,8 @@ def _withheld(variance: float, bias: float, untried: float) -> str:
 
 
 def _same_reward(model: EmpiricalMDP, empirical: EmpiricalProblem) -> str:
+    if model.given and not model.reward_variance[empirical.used].any():
+        return "no reward varies in these tuples, and nothing else is estimated where the dynamics are given"
     rewards = model.reward[empirical.used]
     if np.ptp(rewards) == 0 and not model.reward_variance[empirical.used].any():
         return "every reward seen is the same"

@@ -11,7 +11,7 @@ from typing import Generic, Protocol, TypeVar, runtime_checkable
 import numpy as np
 
 from erl_torch.checks import InputError
-from erl_torch.experience.transitions import Checksum, Transitions, regroup
+from erl_torch.experience.transitions import COLUMNS, WEIGHT, Checksum, Transitions, regroup
 
 EXPERIENCE = "experience, as of Transitions or read_experience"  # what is allowed, in messages
 Part = TypeVar("Part")
@@ -117,6 +117,76 @@ def permitted(
     if told is not None:
         told(f"{len(data) - n:,} of {len(data):,} tuples are left out: the prior of their action is 0")
     return data.where(taken(data)) if isinstance(data, Transitions) else Selection(data, taken, n)
+
+
+class Unweighted:
+    """The same tuples as ``data``, each of weight 1."""
+
+    def __init__(self, data: Experience) -> None:
+        self._data = data
+
+    def __len__(self) -> int:
+        return len(self._data)
+
+    def check_range(self, n_states: int, n_actions: int) -> None:
+        self._data.check_range(n_states, n_actions)
+
+    def chunks(self, multiple: int = 1) -> Iterator[Transitions]:
+        return map(without_weight, self._data.chunks(multiple))
+
+    def checksum(self) -> int:
+        running = Checksum()
+        return [running.of(chunk) for chunk in self.chunks()][-1]
+
+
+def without_weight(chunk: Transitions) -> Transitions:
+    return Transitions.checked(*(getattr(chunk, name) for name in COLUMNS))
+
+
+def is_weighted(data: Experience) -> bool:
+    """Whether the tuples have weights: those of the first chunk say it of all."""
+    return next(data.chunks()).weight is not None
+
+
+def check_unweighted(key: str, data: Experience, allowed: str) -> None:
+    """Raise InputError, of the column, where there are weights that would count for nothing."""
+    if is_weighted(data):
+        raise InputError(f"{key}.{WEIGHT}", "a column", f"left out: {allowed}")
+
+
+def weighing(data: Experience, n_states: int, n_actions: int) -> Experience:
+    """The tuples of ``data`` whose weight is above 0; ``Unweighted`` where every weight is 1, and ``data`` itself where
+    there are none.
+
+    Raises:
+        InputError: a tuple out of range, or a pair all of whose tuples have weight 0; it is named.
+    """
+    if not is_weighted(data):
+        return data
+    data.check_range(n_states, n_actions)
+    largest = np.full(n_states * n_actions, -1.0)
+    n, ones = 0, True
+    for chunk in data.chunks():
+        assert chunk.weight is not None
+        np.maximum.at(largest, chunk.s * np.int32(n_actions) + chunk.a, chunk.weight)
+        n += int((chunk.weight > 0).sum())
+        ones = ones and bool((chunk.weight == 1).all())
+    nothing = np.flatnonzero(largest == 0)
+    if len(nothing):
+        s, a = divmod(int(nothing[0]), n_actions)
+        more = f" (and at {len(nothing) - 1} other pairs)" if len(nothing) > 1 else ""
+        allowed = "above 0 somewhere: other dynamics lead where these tuples never do, which no weight makes up for"
+        raise InputError(f"weight of state {s}, action {a}{more}", "0 in every tuple", allowed)
+    if ones:
+        return without_weight(data) if isinstance(data, Transitions) else Unweighted(data)
+    if n == len(data):
+        return data
+
+    def counts(chunk: Transitions) -> np.ndarray:
+        assert chunk.weight is not None
+        return np.asarray(chunk.weight > 0)
+
+    return data.where(counts(data)) if isinstance(data, Transitions) else Selection(data, counts, n)
 
 
 def tuple_at(data: Experience, t: int) -> tuple[int, int, float]:

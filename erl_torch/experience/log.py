@@ -29,7 +29,7 @@ from erl_torch.experience.formats.roles import Roles, roles_of
 from erl_torch.experience.formats.rows import Rows, Seen, terminations
 from erl_torch.experience.formats.table import Cells, InOrder, Table, is_frame, of_frame, of_npz, open_table
 from erl_torch.experience.recording import CHUNK, READ, FileRecording, Recordable
-from erl_torch.experience.transitions import COLUMNS, Transitions
+from erl_torch.experience.transitions import COLUMNS, WEIGHT, Transitions
 from erl_torch.labels import Labels
 from erl_torch.mdp.ends import RULES, EndRule, Failures
 from erl_torch.mdp.tabular import check_policy, uniform
@@ -276,12 +276,12 @@ def table_of(path: Recordable) -> Table:
 
 
 class Tuples(InOrder):
-    """What a reader of the five columns reads, as a table."""
-
-    names: Sequence[str] = COLUMNS
+    """What a reader of the five columns (and weights) reads, as a table."""
 
     def __init__(self, reader: Any) -> None:
         self.path, self._reader = reader.path, reader
+        first: Mapping[str, np.ndarray] = next(reader.batches(1, False), {})
+        self.names: Sequence[str] = (*COLUMNS, WEIGHT) if WEIGHT in first else COLUMNS
 
     def batches(self, names: Sequence[str], rows: int, strict: bool) -> Any:
         for batch in self._reader.batches(rows, strict):

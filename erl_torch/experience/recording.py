@@ -2,8 +2,9 @@
 
 ``read_experience`` picks the reader from the path
 
-    FILE.npz          columns s, a, r, s_next, a_next, as ``Transitions.save`` writes them
-    DIRECTORY         s.npy, a.npy, r.npy, s_next.npy, a_next.npy, as ``ColumnWriter`` writes them: the fastest
+    FILE.npz          columns s, a, r, s_next, a_next, and weight or not, as ``Transitions.save`` writes them
+    DIRECTORY         s.npy, a.npy, r.npy, s_next.npy, a_next.npy (weight.npy), as ``ColumnWriter`` writes them: the
+                      fastest
     FILE.csv, .tsv, .jsonl, .parquet, .pq, or a directory of such parts: see erl_torch.experience.formats.rows
                       (CSV and Parquet need pyarrow)
     minari:DATASET    episodes of a local Minari data set (needs minari and h5py)
@@ -36,7 +37,7 @@ from erl_torch.experience.formats.format import Batch, Format, Options, Reader
 from erl_torch.experience.formats.npy import ColumnWriter
 from erl_torch.experience.formats.rows import reader_of
 from erl_torch.experience.formats.table import is_frame, of_frame
-from erl_torch.experience.transitions import COLUMNS, TYPES, Checksum, Transitions, join, regroup
+from erl_torch.experience.transitions import COLUMNS, REAL, TYPES, WEIGHT, Checksum, Transitions, join, regroup
 from erl_torch.labels import Labels
 
 CHUNK = 1 << 22  # tuples held in memory: 100 MB of columns
@@ -153,12 +154,13 @@ class FileRecording:
     def _read(self, rows: int) -> Iterator[Transitions]:
         row = 0
         for batch in self._reader.batches(rows, self._strict):
-            shapes = {name: np.shape(batch[name]) if name in batch else () for name in COLUMNS}
+            names = (*COLUMNS, WEIGHT) if WEIGHT in batch else COLUMNS
+            shapes = {name: np.shape(batch[name]) if name in batch else () for name in names}
             if len(shapes["s"]) != 1 or len(set(shapes.values())) > 1:
                 raise InputError(
                     f"path={self.path}", f"shapes {shapes} from row {row} on", "five columns of one length"
                 )
-            columns = {name: self._typed(name, batch[name]) for name in COLUMNS}
+            columns = {name: self._typed(name, batch[name]) for name in names}
             n = len(columns["s"])
             bad = self._bad(columns, row)
             row += n
@@ -167,15 +169,15 @@ class FileRecording:
                 columns = {name: column[~bad] for name, column in columns.items()}
             if len(columns["s"]):
                 yield Transitions.checked(
-                    *(np.ascontiguousarray(columns[name], TYPES[name].newbyteorder("=")) for name in COLUMNS)
+                    *(np.ascontiguousarray(columns[name], TYPES[name].newbyteorder("=")) for name in names)
                 )
 
     def _typed(self, name: str, column: np.ndarray) -> np.ndarray:
         if column.dtype.kind not in "iuf":  # numbers that are not whole are bad tuples
-            allowed = "numbers" if name == "r" else "whole numbers"
+            allowed = "numbers" if name in REAL else "whole numbers"
             raise InputError(f"path={self.path}: {name}", f"dtype {column.dtype}", f"a column of {allowed}")
         with np.errstate(over="ignore"):  # of wider numbers: they are no longer finite
-            return np.asarray(column, np.float64) if name == "r" else column
+            return np.asarray(column, np.float64) if name in REAL else column
 
     def _bad(self, columns: Batch, first: int) -> np.ndarray | None:
         """Mask of the bad tuples, None without any. Raises InputError for the first where that is an error."""
@@ -183,8 +185,9 @@ class FileRecording:
         for name, column in columns.items():
             if not len(column):
                 return None
-            if name == "r":
-                mask = ~np.isfinite(column)
+            if name in REAL:
+                fits, _ = checks.FINITE if name == "r" else checks.NOT_NEGATIVE
+                mask = ~fits(column)
                 if mask.any():
                     wrong[name] = mask
             elif column.dtype.kind == "f":
@@ -198,7 +201,8 @@ class FileRecording:
         bad = np.logical_or.reduce(list(wrong.values()))
         i = int(np.argmax(bad))
         name = next(name for name, mask in wrong.items() if mask[i])
-        allowed = "finite" if name == "r" else f"a whole number in [0, {self._limits[name]})"
+        allowed = {"r": checks.FINITE[1], WEIGHT: checks.NOT_NEGATIVE[1]}.get(name, "")
+        allowed = allowed or f"a whole number in [0, {self._limits[name]})"
         error = InputError(f"path={self.path}: {name}[{first + i}]", columns[name][i].item(), allowed)
         if self._strict:
             raise error

@@ -1,11 +1,11 @@
-"""Tuples (s, a, r, s', a') in memory: ``Transitions``, five columns of one length."""
+"""Tuples (s, a, r, s', a') in memory: ``Transitions``, five columns of one length, or six with weights."""
 
 from __future__ import annotations
 
 import os
 import zlib
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +17,9 @@ from erl_torch.files import read_npz, write_npz
 from erl_torch.labels import Labels
 
 COLUMNS = ("s", "a", "r", "s_next", "a_next")
-TYPES = {name: np.dtype("<f8" if name == "r" else "<i4") for name in COLUMNS}  # in files
+WEIGHT = "weight"  # the column that need not be there
+REAL = ("r", WEIGHT)  # columns of numbers that need not be whole
+TYPES = {name: np.dtype("<f8" if name in REAL else "<i4") for name in (*COLUMNS, WEIGHT)}  # in files
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +32,9 @@ class Transitions:
     Args:
         s, a, s_next, a_next: whole numbers >= 0, [N].
         r: finite rewards, [N].
+        weight: finite numbers >= 0, [N], what each tuple counts for: p^(s'|s,a) / p(s'|s,a), of the dynamics that are
+            to be learnt and those that the tuples are of, up to a factor of each pair (docs/other-dynamics.md). None: 1
+            each.
 
     Raises:
         InputError: the column (and row) that is not as above.
@@ -40,14 +45,14 @@ class Transitions:
     r: np.ndarray  # [N] float64
     s_next: np.ndarray  # [N] int32
     a_next: np.ndarray  # [N] int32
+    weight: np.ndarray | None = None  # [N] float64
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            object.__setattr__(self, field.name, _column(field.name, getattr(self, field.name)))
-        for field in fields(self):
-            if len(getattr(self, field.name)) != len(self.s):
-                lengths = {f.name: len(getattr(self, f.name)) for f in fields(self)}
-                raise InputError("columns", f"lengths {lengths}", "of one length")
+        for name in self.names:
+            object.__setattr__(self, name, _column(name, getattr(self, name)))
+        lengths = {name: len(column) for name, column in self.arrays().items()}
+        if len(set(lengths.values())) > 1:
+            raise InputError("columns", f"lengths {lengths}", "of one length")
         if len(self) == 0:
             raise InputError("transitions", "0 tuples", "at least one tuple")
 
@@ -61,12 +66,14 @@ class Transitions:
         a_next: Iterable[object],
         states: Labels | None = None,
         actions: Labels | None = None,
+        weight: Iterable[float] | None = None,
     ) -> Labelled:
         """Make them of columns [N] of labels, as ``erl_torch.Labels``: whole numbers, texts, tuples.
 
         Args:
             states, actions: labels that are known; None: those met, in the order in which they first appear, row by row
                 and s, a before s', a'.
+            weight: as of ``Transitions``.
 
         Raises:
             InputError: no label, or one that is not known; the message names column and row.
@@ -81,10 +88,20 @@ class Transitions:
             own = labels[name[0]]
             assert own is not None
             columns[name] = own.encode_all(columns[name], name)
-        return Labelled(cls(**columns), labels["s"], labels["a"])  # type: ignore[arg-type]
+        weights = None if weight is None else _label_column(weight)
+        return Labelled(cls(**columns, weight=weights), labels["s"], labels["a"])  # type: ignore[arg-type]
 
     def __len__(self) -> int:
         return len(self.s)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the columns that there are."""
+        return COLUMNS if self.weight is None else (*COLUMNS, WEIGHT)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The columns that there are, by name."""
+        return {name: getattr(self, name) for name in self.names}
 
     def first(self, n: int) -> Transitions:
         """The first ``n`` tuples."""
@@ -92,15 +109,17 @@ class Transitions:
 
     def where(self, rows: slice | np.ndarray) -> Transitions:
         """The tuples of a slice or mask; at least one."""
-        return Transitions.checked(*(getattr(self, name)[rows] for name in COLUMNS))
+        return Transitions.checked(*(column[rows] for column in self.arrays().values()))
 
     @classmethod
     def checked(cls, *columns: np.ndarray) -> Transitions:
-        """Make them of columns that are known to be right, types and lengths included. Nothing is checked again."""
+        """Make them of five columns, or six, that are known to be right, types and lengths included. Nothing is checked
+        again."""
         if not len(columns[0]):
             raise InputError("transitions", "0 tuples", "at least one tuple")
         new = object.__new__(cls)
-        for name, column in zip(COLUMNS, columns, strict=True):
+        weight = columns[len(COLUMNS)] if len(columns) > len(COLUMNS) else None
+        for name, column in zip((*COLUMNS, WEIGHT), (*columns[: len(COLUMNS)], weight), strict=True):
             object.__setattr__(new, name, column)
         return new
 
@@ -124,11 +143,11 @@ class Transitions:
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the columns to a compressed npz file (temporary name, then renamed)."""
-        return write_npz(path, {field.name: getattr(self, field.name) for field in fields(self)})
+        return write_npz(path, self.arrays())
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Transitions:
-        """Read what ``save`` wrote, or any npz with these five columns; further arrays are passed over.
+        """Read what ``save`` wrote, or any npz with the five columns, and weight if there; others are passed over.
 
         Raises InputError naming the file.
         """
@@ -137,7 +156,7 @@ class Transitions:
         if missing:
             raise InputError("path", path, f"an npz with columns {', '.join(COLUMNS)}; it lacks {missing[0]}")
         try:
-            return cls(**{name: arrays[name] for name in COLUMNS})
+            return cls(**{name: arrays[name] for name in (*COLUMNS, WEIGHT) if name in arrays})
         except InputError as error:
             raise error.of_file(path) from error
 
@@ -159,12 +178,12 @@ class Checksum:
     """A running CRC-32 of each column."""
 
     def __init__(self) -> None:
-        self.columns = dict.fromkeys(COLUMNS, 0)
+        self.columns: dict[str, int] = {}
 
     def of(self, chunk: Transitions) -> int:
         """The checksum of all chunks so far, this one included."""
-        for name, crc in self.columns.items():
-            self.columns[name] = zlib.crc32(memoryview(getattr(chunk, name)), crc)
+        for name, column in chunk.arrays().items():
+            self.columns[name] = zlib.crc32(memoryview(column), self.columns.get(name, 0))
         return zlib.crc32(np.array(list(self.columns.values()), "<u4").tobytes())
 
 
@@ -180,29 +199,31 @@ def regroup(chunks: Iterable[Transitions], multiple: int) -> Iterator[Transition
             held = []
             yield joined if whole == n else joined.where(slice(whole))
             if whole < n:  # copied: a view would hold on to the chunk
-                held = [Transitions.checked(*(getattr(joined, name)[whole:].copy() for name in COLUMNS))]
+                held = [Transitions.checked(*(column[whole:].copy() for column in joined.arrays().values()))]
     if held:
         yield join(held)
 
 
 def join(chunks: list[Transitions]) -> Transitions:
-    """The tuples of ``chunks``, in order, as one."""
+    """The tuples of ``chunks``, in order, as one: of one stream, so that all have weights or none has."""
     if len(chunks) == 1:
         return chunks[0]
-    return Transitions.checked(*(np.concatenate([getattr(chunk, name) for chunk in chunks]) for name in COLUMNS))
+    columns = [chunk.arrays() for chunk in chunks]
+    return Transitions.checked(*(np.concatenate([column[name] for column in columns]) for name in columns[0]))
 
 
 def _column(name: str, value: object) -> np.ndarray:
     column = checks.real(name, value)
     if column.ndim != 1:
         raise InputError(name, f"array of shape {column.shape}", "one-dimensional")
-    if name == "r":
+    if name in REAL:
         if column.dtype.kind == "b":
             raise InputError(name, f"dtype {column.dtype}", "an array of numbers")
         column = np.ascontiguousarray(column, dtype=np.float64)
-        if not np.isfinite(column).all():
-            row = int(np.argmin(np.isfinite(column)))
-            raise InputError(f"r[{row}]", column[row], "finite")
+        fits, allowed = checks.FINITE if name == "r" else checks.NOT_NEGATIVE
+        if not (good := fits(column)).all():
+            row = int(np.argmin(good))
+            raise InputError(f"{name}[{row}]", column[row], allowed)
         return column
     if column.dtype.kind not in "iuf" and column.size:
         raise InputError(name, f"dtype {column.dtype}", "an array of whole numbers")

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.empirical.counts import EmpiricalMDP, tally
-from erl_torch.experience.experience import Experience, permitted
+from erl_torch.experience.experience import Experience, check_unweighted, permitted
 from erl_torch.mdp.tabular import TabularMDP, check_prior
 from erl_torch.notes import note
 from erl_torch.solvers.chains import long_run
@@ -82,6 +82,7 @@ def demonstrated(
     if isinstance(demonstrations, Experience):
         if exact:
             raise InputError("exact", True, "False for tuples: a finite number of steps is not a policy")
+        check_unweighted("demonstrations", demonstrations, "only actions are explained here, and weights are of s'")
         kept = permitted(demonstrations, prior, next_actions=False, told=note)
         counts = tally(kept, *prior.shape).visits.reshape(prior.shape).astype(np.float64)
     else:

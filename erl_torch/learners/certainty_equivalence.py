@@ -19,6 +19,7 @@ import numpy as np
 import torch
 
 from erl_torch import checks
+from erl_torch.checks import InputError
 from erl_torch.empirical.counts import NOISE, EmpiricalMDP, EmpiricalProblem, empirical_mdp, joint
 from erl_torch.experience.experience import Experience
 from erl_torch.learners.learner import StreamLearner, columns, message
@@ -88,6 +89,7 @@ class CertaintyEquivalence(StreamLearner[CertaintyEquivalenceState, CertaintyEqu
 
     states: ClassVar[tuple[type, ...]] = (CertaintyEquivalenceState,)
     stream_bytes: ClassVar[int] = 1  # counts alone
+    takes_weights: ClassVar[bool] = True
 
     beta: float = 10.0
     optimism: float = 0.0
@@ -109,6 +111,15 @@ class CertaintyEquivalence(StreamLearner[CertaintyEquivalenceState, CertaintyEqu
         recurrent class; theta is then that of the closed set of states (of several, the most visited). NO_SINGLE_RATE,
         below optimism 0, where the data have none: then there is no theta."""
         return super().fit(transitions, n_states, n_actions)
+
+    def solve(self, model: EmpiricalMDP) -> Solution:
+        """The solution of counts that there are already, of ``empirical_mdp`` or ``for_dynamics``; as ``fit``."""
+        checks.instance("model", model, EmpiricalMDP, "an EmpiricalMDP, as of empirical_mdp")
+        if self.reward_noise == "joint" and self.optimism:
+            raise InputError("reward_noise", "joint", "mean where the tuples themselves are not there")
+        empirical = model.problem(self.beta, self.prior_policy, optimism=self.optimism)
+        stream = CertaintyEquivalenceStream(model, empirical, int(model.visits.sum()))
+        return self.solution(self.step(self.init(model.n_states, model.n_actions), stream))
 
     def finished(self, state: CertaintyEquivalenceState) -> bool:
         """Once solved."""

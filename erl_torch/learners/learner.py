@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from erl_torch import checks
-from erl_torch.experience.experience import EXPERIENCE, Experience, permitted
+from erl_torch.experience.experience import EXPERIENCE, Experience, check_unweighted, permitted
 from erl_torch.log.quantities import Quantity
 from erl_torch.mdp.tabular import check_policy, uniform
 from erl_torch.problem import Policy, Problem
@@ -19,6 +19,9 @@ from erl_torch.solution import Solution, Status
 
 Table = torch.Tensor | np.ndarray | None
 Metric = float | np.ndarray  # of one learner; [R] of replicas
+
+
+WITH_WEIGHTS = "but CertaintyEquivalence and EfficientS1 have"
 
 
 class NonFiniteError(ArithmeticError):
@@ -180,6 +183,7 @@ class StreamLearner(ABC, Generic[T, Prepared]):
     states: ClassVar[tuple[type, ...]] = ()
     quantities: ClassVar[tuple[Quantity, ...]] = ()
     stream_bytes: ClassVar[int] = 40  # memory of a tuple in ``prepare``d experience
+    takes_weights: ClassVar[bool] = False  # weights of tuples count; elsewhere they are an error
 
     beta: float
     optimism: float = 0.0
@@ -248,11 +252,17 @@ class StreamLearner(ABC, Generic[T, Prepared]):
         then still good.
         """
         checks.instance("transitions", transitions, Experience, EXPERIENCE)
+        self.check_weights(transitions)
         stream = self.prepare(self.permitted(transitions, n_states, n_actions), n_states, n_actions)
         state = self.init(n_states, n_actions) if state is None else state
         while not self.finished(state):
             state = self.step(state, stream)
             yield state
+
+    def check_weights(self, transitions: Experience) -> None:
+        """Raise InputError where the tuples have weights that would count for nothing."""
+        if not self.takes_weights:
+            check_unweighted("transitions", transitions, f"{type(self).__name__} has no weights, {WITH_WEIGHTS}")
 
     def permitted(self, transitions: Experience, n_states: int, n_actions: int) -> Experience:
         """The tuples of actions that there are, those with a prior above 0: what is learnt from."""

@@ -283,12 +283,16 @@ class Replicas(Together):
         """Raise InputError unless ``experience`` is what the replicas can learn from."""
         prior = self.prior_policy(n_states, n_actions)
         if isinstance(experience, Transitions):
+            self.learners[0].check_weights(experience)
             return
         if hasattr(experience, "chunks"):
             raise InputError("experience", "a recording in files", "in memory: recording.load()")
         streams = experience.seeds if isinstance(experience, Simulation) else experience
         if len(streams) != len(self):
             raise InputError("experience", f"{len(streams)} streams", f"one, or one for each of {len(self)} replicas")
+        if not isinstance(experience, Simulation):
+            for data in experience:
+                self.learners[0].check_weights(data)
         if isinstance(experience, Simulation) and experience.mdp.reward.shape != (n_states, n_actions):
             shape = experience.mdp.reward.shape
             raise InputError("experience", f"an MDP of shape {shape}", f"of shape {(n_states, n_actions)}")

@@ -16,7 +16,8 @@ from erl_torch.checks import InputError
 from erl_torch.labels import Labels
 
 Batch = dict[str, np.ndarray]
-"""Columns s, a, r, s_next, a_next of one length, of any type of numbers; they are checked and converted elsewhere."""
+"""Columns s, a, r, s_next, a_next, and weight where there are weights, of one length, of any type of numbers; they are
+checked and converted elsewhere."""
 
 
 class Options(NamedTuple):

@@ -7,7 +7,7 @@ import os
 import shutil
 import warnings
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import IO
@@ -19,7 +19,7 @@ from erl_torch.checks import InputError
 from erl_torch.experience.formats import rows
 from erl_torch.experience.formats.format import ALLOWED, Batch, Options, Reader, readable
 from erl_torch.experience.formats.table import of_npz
-from erl_torch.experience.transitions import COLUMNS, TYPES, Transitions
+from erl_torch.experience.transitions import COLUMNS, TYPES, WEIGHT, Transitions
 from erl_torch.files import check_directory
 
 
@@ -85,12 +85,15 @@ class Columns:
                 if not path.is_file():
                     raise InputError("path", self.path, f"a directory of {name}.npy and the like; it lacks {name}.npy")
                 files[name] = stack.enter_context(path.open("rb"))
+            if (weight := Path(self.path, f"{WEIGHT}.npy")).is_file():
+                files[WEIGHT] = stack.enter_context(weight.open("rb"))
             return {name: (file, os.fstat(file.fileno()).st_size) for name, file in files.items()}
         archive = stack.enter_context(zipfile.ZipFile(self.path))
         check_directory(archive)
         members: dict[str, tuple[IO[bytes], int]] = {}
-        for name in COLUMNS:
-            if f"{name}.npy" not in archive.namelist():
+        there = archive.namelist()
+        for name in COLUMNS if f"{WEIGHT}.npy" not in there else (*COLUMNS, WEIGHT):
+            if f"{name}.npy" not in there:
                 allowed = f"an npz with columns {', '.join(COLUMNS)}; it lacks {name}"
                 raise InputError("path", self.path, allowed)
             member = stack.enter_context(archive.open(f"{name}.npy"))
@@ -151,14 +154,24 @@ class ColumnWriter:
         check_target("directory", self.directory)
         shutil.rmtree(self._temporary, ignore_errors=True)
         self._temporary.mkdir(parents=True)
-        self._files = {name: (self._temporary / f"{name}.npy").open("wb") for name in COLUMNS}
-        self._head()
+        self._files: dict[str, IO[bytes]] = {}
+        self._open(COLUMNS)
         return self
 
     def append(self, chunk: Transitions) -> None:
-        for name, file in self._files.items():
-            getattr(chunk, name).astype(TYPES[name], copy=False).tofile(file)
+        """Raises InputError where some chunks have weights and others have none."""
+        columns = chunk.arrays()
+        if not self._n and WEIGHT in columns:
+            self._open((WEIGHT,))
+        if columns.keys() != self._files.keys():
+            raise InputError(f"transitions.{WEIGHT}", "a column of some chunks", "a column of all chunks, or of none")
+        for name, column in columns.items():
+            column.astype(TYPES[name], copy=False).tofile(self._files[name])
         self._n += len(chunk)
+
+    def _open(self, names: Sequence[str]) -> None:
+        self._files |= {name: (self._temporary / f"{name}.npy").open("wb") for name in names}
+        self._head()
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
@@ -222,11 +235,12 @@ def _our_columns(path: Path) -> bool:
     entries = list(path.iterdir()) if path.is_dir() else [path]
     if not entries:
         return True
-    if {entry.name for entry in entries} != {f"{name}.npy" for name in COLUMNS}:
+    names = {entry.name.removesuffix(".npy"): entry.suffix for entry in entries}
+    if names.keys() - {WEIGHT} != set(COLUMNS) or set(names.values()) != {".npy"}:
         return False
     columns = {}
     try:
-        for name in COLUMNS:
+        for name in names:
             if (path / f"{name}.npy").is_symlink():
                 return False
             with (path / f"{name}.npy").open("rb") as file:
@@ -234,12 +248,12 @@ def _our_columns(path: Path) -> bool:
     except (OSError, ValueError, UserWarning):
         return False
     same_length = len({column.claimed for column in columns.values()}) == 1
-    return same_length and all(columns[name].dtype == TYPES[name] for name in COLUMNS)
+    return same_length and all(column.dtype == TYPES[name] for name, column in columns.items())
 
 
 def _our_npz(path: Path) -> bool:
     try:
         with zipfile.ZipFile(path) as archive:
-            return sorted(archive.namelist()) == sorted(f"{name}.npy" for name in COLUMNS)
+            return set(archive.namelist()) - {f"{WEIGHT}.npy"} == {f"{name}.npy" for name in COLUMNS}
     except (OSError, zipfile.BadZipFile):
         return False

@@ -19,8 +19,10 @@ NAMES = {
     "truncated": "truncated truncations timeout timeouts",
     "episode": "episode episodes episode_id",
     "step": "step steps t",
+    "weight": "importance_weight importance_weights",
 }
 NEEDED = ("s", "a", "r")
+OUR_OWN = {"s", "a", "r", "s_next", "a_next", "weight"}  # beside these alone a "weight" is not of something else
 AS_TUPLES = ("s", "a", "s_next", "a_next")  # several columns may be one
 SHOWN = 30  # names of columns in a message
 
@@ -50,6 +52,8 @@ def roles_of(source: Table, columns: Mapping[str, Any] | None) -> Roles:
             raise InputError(f"path={source.path}: {role}", " and ".join(found), allowed)
         if found:
             roles[role] = (found[0],)
+    if "weight" not in {*roles, *(columns or {})} and set(source.names) >= OUR_OWN and "weight" not in taken:
+        roles["weight"] = ("weight",)
     _check(source, roles, there)
     return roles
 

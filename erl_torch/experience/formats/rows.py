@@ -2,7 +2,7 @@
 
 A row is a step: its state s, its action a, its reward r and, where there are such columns, the state after
 (``s_next``), the action drawn there (``a_next``), whether the step ``terminated`` or ``truncated`` its episode, the
-``episode`` it is of and the ``step`` of that (``erl_torch.experience.formats.roles``).
+``episode`` it is of and the ``step`` of that, and its ``weight`` (``erl_torch.experience.formats.roles``).
 
 Ends, as in ``erl_torch.experience.collect``. Where a row terminates its episode, s' is the state of the next row, the
 first of the next episode (the first row follows the last). Where an episode is truncated, or just ends, s' is
@@ -93,6 +93,7 @@ class Block(NamedTuple):
     step: np.ndarray  # NaN: not in the table
     bad: np.ndarray
     x: np.ndarray  # in [0, 1), for a'
+    weight: np.ndarray  # 1 without such a column
 
     def at(self, rows: slice | np.ndarray) -> Block:
         return Block(*(column[rows] for column in self))
@@ -192,6 +193,10 @@ class Rows:
             flags["terminated"] &= terminations(self._roles, parts)
             codes = {role: self._coded(role, parts, flags["terminated"], wrong) for role in self._encodings}
             wrong.found("r", ~np.isfinite(r), parts["r"], finite)
+            weight = np.ones(n)
+            if "weight" in parts:
+                weight = numbers(parts["weight"][0], self._source.decimal_comma)
+                wrong.found("weight", ~(np.isfinite(weight) & (weight >= 0)), parts["weight"], f"{finite} >= 0")
             begins = np.zeros(n, bool)
             if "episode" in parts:
                 values, episode = parts["episode"][0].factors()
@@ -207,7 +212,7 @@ class Rows:
             self.seen.rows += n
             x = rng.random(n) if self._cdf is not None else np.zeros(n)
             yield Block(wrong.row, codes["s"], codes["a"], r, codes["s_next"], codes["a_next"], flags["terminated"],
-                        flags["truncated"], begins, step, wrong.raised(), x)  # fmt: skip
+                        flags["truncated"], begins, step, wrong.raised(), x, weight)  # fmt: skip
 
     def _coded(
         self, role: str, parts: Mapping[str, Sequence[Cells]], terminated: np.ndarray, wrong: _Wrong
@@ -278,12 +283,13 @@ class Rows:
             self.seen.first_bad = self.seen.first_bad or f"{name}=missing"
             bad = bad | missing
         self.seen.bad += int(bad.sum())
-        columns = (now.s, now.a, now.r, s_next, a_next, now.x)
+        columns = (now.s, now.a, now.r, s_next, a_next, now.x, now.weight)
         if (leave := bad | out).any():
             columns = tuple(column[~leave] for column in columns)
-        s, a, r, s_next, a_next, x = columns
+        s, a, r, s_next, a_next, x, weight = columns
         self.seen.sum_of_rewards += float(r.sum())
-        return {"s": s, "a": a, "r": r, "s_next": s_next, "a_next": self._next_actions(s_next, a_next, x)}
+        batch = {"s": s, "a": a, "r": r, "s_next": s_next, "a_next": self._next_actions(s_next, a_next, x)}
+        return batch | {"weight": weight} if "weight" in self._roles else batch
 
     def _next_actions(self, s_next: np.ndarray, a_next: np.ndarray, x: np.ndarray) -> np.ndarray:
         """a', drawn where it is missing, or lacking in s'."""

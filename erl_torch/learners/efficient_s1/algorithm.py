@@ -57,6 +57,11 @@ too small by about CV^2 / (2 kappa n), CV^2 the relative variance of exp(kappa V
 ``reward_noise="joint"``: r and s' of a tuple count together, (1/kappa) log <exp(kappa (r + V(s')))>, as in
 ``erl_torch.empirical.counts.joint``; "mean": r is the mean over the visits.
 
+Tuples with weights w (docs/other-dynamics.md): <.> are means with weights, and lines 10-11 take the steps a_n w/w_bar
+and lr_rho w/w_bar, w_bar the mean weight of the pair, so that z, rho change on average as under the other dynamics; a_n
+is at most w_bar/max(w), so that every update is a convex combination still. Not online, and not without
+``sample_mean_psi``.
+
 Online (``online``): one pass over a stream without end, no tuple kept: tables of S*A numbers, and the counts
 n(s,a,s') that occur. The stream is cut into phases that end at S A tuples times powers of ``phase_growth``; V is fixed
 in a phase, while <V> and r are means over all visits and z, rho run as above on fresh tuples; at its end
@@ -99,7 +104,7 @@ from scipy.special import logsumexp, softmax
 from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.empirical.counts import NOISE, EmpiricalMDP, EmpiricalProblem, empirical_mdp, joint, tally
-from erl_torch.experience.experience import Experience, Parts, Selection
+from erl_torch.experience.experience import Experience, Parts, Selection, check_unweighted, is_weighted, weighing
 from erl_torch.experience.transitions import Transitions
 from erl_torch.learners.efficient_s1 import kernels
 from erl_torch.learners.learner import NonFiniteError, StreamLearner, columns, message
@@ -279,6 +284,20 @@ class OnlineState(EfficientState):
         return super().metrics() | {"n_replaced": self.n_replaced}
 
 
+def _weights(data: Experience, model: EmpiricalMDP) -> tuple[np.ndarray, np.ndarray]:
+    """(mean weight of each pair, its largest weight over that), [S*A] each; 1 where there is no visit."""
+    n = model.visits.size
+    total, largest = np.zeros(n), np.zeros(n)
+    for chunk in data.chunks():
+        assert chunk.weight is not None
+        pair = chunk.s * np.int32(model.n_actions) + chunk.a
+        np.add.at(total, pair, chunk.weight)
+        np.maximum.at(largest, pair, chunk.weight)
+    met = total > 0
+    mean = np.where(met, total / np.maximum(model.visits.ravel(), 1), 1.0)
+    return mean, np.where(met, largest / mean, 1.0)
+
+
 @dataclass(frozen=True, eq=False)
 class EfficientStream:
     """A stream made ready for the compiled loops: done once a fit."""
@@ -287,6 +306,8 @@ class EfficientStream:
     parts: Parts[tuple[np.ndarray, np.ndarray, np.ndarray]]  # a chunk each, int32, int32, float64:
     #   s * A + a; s', or s' * A + a'; beta r where `noisy`, else [0]
     #   (kappa r where rewards count jointly with s')
+    weights: Parts[np.ndarray | None]  # a chunk each: w over the mean of the pair, None without weights
+    largest_weight: np.ndarray  # of each pair, [S*A]; empty without weights
     noisy: bool  # each tuple's own r is in the third column
     own_reward: bool  # ... as exp(beta r), in place of the mean reward
     log_factor_max: float  # of the third column
@@ -329,6 +350,7 @@ class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
 
     states: ClassVar[tuple[type, ...]] = (EfficientState,)
     stream_bytes: ClassVar[int] = 8  # pairs
+    takes_weights: ClassVar[bool] = True
 
     beta: float = 10.0
     optimism: float = 0.0
@@ -511,7 +533,10 @@ class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
 
     def prepare(self, transitions: Experience, n_states: int, n_actions: int) -> EfficientStream:
         """Validate the stream against the sizes and compute what is the same in every epoch: one pass, or a few."""
-        data, lr_psi = transitions, 0.0 if self.sample_mean_psi else self.lr_psi
+        data, lr_psi = weighing(transitions, n_states, n_actions), 0.0 if self.sample_mean_psi else self.lr_psi
+        weighted = is_weighted(data)
+        if weighted and not self.sample_mean_psi:
+            raise InputError("sample_mean_psi", False, "true where tuples have weights")
         found = tally(data, n_states, n_actions, lr_psi)
         model = empirical_mdp(data, n_states, n_actions, found)
         part = model.problem(self.beta, self.prior_policy, optimism=self.optimism)
@@ -552,6 +577,12 @@ class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
         unit = self.kappa if together else self.beta
 
         inside = part.used if self.unvisited == "exclude" else prior > 0
+        mean_weight, largest_weight = _weights(data, model) if weighted else (np.empty(0), np.empty(0))
+
+        def relative_weights(chunk: Transitions) -> np.ndarray | None:
+            if chunk.weight is None:
+                return None
+            return np.asarray(chunk.weight / mean_weight[chunk.s * np.int32(n_actions) + chunk.a])
 
         def columns(chunk: Transitions) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             after = chunk.s_next if self.expected_backup else chunk.s_next * np.int32(n_actions) + chunk.a_next
@@ -560,6 +591,8 @@ class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
         return EfficientStream(
             n_tuples=len(transitions),
             parts=Parts(data, columns, self._rescale_every(n_states * n_actions)),
+            weights=Parts(data, relative_weights, self._rescale_every(n_states * n_actions)),
+            largest_weight=largest_weight,
             noisy=noisy,
             own_reward=own_reward,
             log_factor_max=max(abs(unit * r) for r in found.reward_range) if noisy else 0.0,
@@ -638,6 +671,7 @@ class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
         Pure: ``state`` is left as it is. Raises InputError as ``online`` does.
         """
         checks.instance("chunk", chunk, Transitions, "Transitions")
+        check_unweighted("chunk", chunk, "the online mode of EfficientS1 has no weights, but its fit has")
         if self.reward_noise == "joint" and self.optimism:
             raise InputError("reward_noise", "joint", "mean in the online mode, which keeps mean rewards only")
         chunk.check_range(*state.log_z.shape)
@@ -807,10 +841,15 @@ class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
             kernel = kernels.tilted_gauge_epoch if plain else kernels.log_tilted_gauge_epoch
         else:
             kernel = kernels.gauge_epoch if plain else kernels.log_gauge_epoch
-        of_tilt = (tilt[0], tilt[1].ravel(), self._largest_steps(state, stream), stream.members) if tilt else ()
+        largest = self._largest_steps(state, stream) if tilt else np.ones(z.size)
+        if len(stream.largest_weight):
+            largest = largest / np.maximum(stream.largest_weight, 1.0)
+            lr_rho = min(lr_rho, 1 / float(stream.largest_weight.max()))
+        of_tilt = (tilt[0], tilt[1].ravel(), largest, stream.members) if tilt else ()
         which = () if tilt else (self.expected_backup,)
         t = 0
-        for pair, after, log_factor in stream.parts:
+        for (pair, after, log_factor), weights in zip(stream.parts, stream.weights, strict=True):
+            of_weights = () if weights is None else (weights,) if tilt else (weights, largest)
             first, last, factor = t, t + len(pair), number(log_factor)
             while t < last:
                 stop = min(last, t - t % BLOCK + BLOCK)
@@ -836,6 +875,7 @@ class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
                     t,
                     stop,
                     first,
+                    *of_weights,
                 )
                 if not healthy:
                     return rho, False

@@ -27,14 +27,15 @@ def _is_healthy(z, q):
 @numba.njit(cache=True, error_model="numpy", nogil=True)
 def gauge_epoch(
     pair, after, factor, noisy, g, z, total, average, weight, n_actions, steps, visits, rho, lr_rho, rho_max,
-    expected, rescale_every, begin, end, first=0,
+    expected, rescale_every, begin, end, first=0, relative=None, largest_step=None,
 ):  # fmt: skip
     """Lines 9-11 over tuples begin..end of a pass, of which ``first`` stands first in the columns; z, total and visits
     [n_pairs] change in place.
 
     ``after`` [N] is s' where ``expected`` (backup y(s') = sum_a weight z) or s' * A + a'. The step of a pair's n-th
     visit is ``steps[min(n, last)]``. With ``average``, total sums z over the visits. Every ``rescale_every`` tuples a
-    power of two brings the largest z to about 1.
+    power of two brings the largest z to about 1. Of tuples with weights, ``relative`` [N] is the weight over the mean
+    of the pair: both steps are times that, where no step of a pair is above its ``largest_step`` [n_pairs] before.
 
     Returns (rho, healthy): not healthy once a number is no longer positive and finite.
     """
@@ -55,6 +56,10 @@ def gauge_epoch(
                 gain *= factor[i]
             w = gain * (y[after[i]] if expected else z[after[i]])
             step = steps[min(visits[k], last)]
+            rate = lr_rho
+            if relative is not None:
+                step = min(step, largest_step[k]) * relative[i]
+                rate = lr_rho * relative[i]
             visits[k] += 1
             z_new = (1.0 - step) * z[k] + step * w / rho
             z[k] = z_new
@@ -62,7 +67,7 @@ def gauge_epoch(
                 total[k] += z_new
             if not expected and k == after[i]:  # a self-loop sees the new z
                 w = gain * z_new
-            rho = (1.0 - lr_rho) * rho + lr_rho * w / z_new
+            rho = (1.0 - rate) * rho + rate * w / z_new
             if rho > rho_max:
                 rho = rho_max
             if expected:
@@ -107,7 +112,7 @@ def _log_row(log_z, log_weight, first, n_actions):
 @numba.njit(cache=True, error_model="numpy", nogil=True)
 def log_gauge_epoch(
     pair, after, log_factor, noisy, log_g, log_z, log_total, average, log_weight, n_actions, steps, visits, log_rho,
-    lr_rho, log_rho_max, expected, rescale_every, begin, end, first=0,
+    lr_rho, log_rho_max, expected, rescale_every, begin, end, first=0, relative=None, largest_step=None,
 ):  # fmt: skip
     """``gauge_epoch`` in logarithms: finite for finite input of any size. Returns (log rho, true)."""
     n_states = log_z.size // n_actions
@@ -125,6 +130,10 @@ def log_gauge_epoch(
                 gain += log_factor[i]
             w = gain + (y[after[i]] if expected else log_z[after[i]])
             step = steps[min(visits[k], last)]
+            rate = lr_rho
+            if relative is not None:
+                step = min(step, largest_step[k]) * relative[i]
+                rate = lr_rho * relative[i]
             visits[k] += 1
             z_new = _log_blend(log_z[k], w - log_rho, step)
             log_z[k] = z_new
@@ -133,7 +142,7 @@ def log_gauge_epoch(
                 log_total[k] = high + math.log1p(math.exp(low - high))
             if not expected and k == after[i]:
                 w = gain + z_new
-            log_rho = min(_log_blend(log_rho, w - z_new, lr_rho), log_rho_max)
+            log_rho = min(_log_blend(log_rho, w - z_new, rate), log_rho_max)
             if expected:
                 s = k // n_actions
                 y[s] = _log_row(log_z, log_weight, s * n_actions, n_actions)
@@ -148,7 +157,7 @@ def log_gauge_epoch(
 @numba.njit(cache=True, error_model="numpy", nogil=True)
 def tilted_gauge_epoch(
     pair, s_next, factor, noisy, g, tilt, share, largest_step, members, z, total, average, weight, n_actions, steps,
-    visits, rho, lr_rho, rho_max, rescale_every, begin, end, first=0,
+    visits, rho, lr_rho, rho_max, rescale_every, begin, end, first=0, relative=None,
 ):  # fmt: skip
     """``gauge_epoch`` with y(s') tilted by e = tilt(s') share(s,a) (times ``factor`` where ``noisy``), whose mean over
     the visits of each pair is 1.
@@ -177,12 +186,16 @@ def tilted_gauge_epoch(
                 e *= factor[i]
             w = g[k] * (least + e * (y[s_next[i]] - least))
             step = min(steps[min(visits[k], last)], largest_step[k])
+            rate = lr_rho
+            if relative is not None:
+                step *= relative[i]
+                rate = lr_rho * relative[i]
             visits[k] += 1
             z_new = (1.0 - step) * z[k] + step * w / rho
             z[k] = z_new
             if average:
                 total[k] += z_new
-            rho = (1.0 - lr_rho) * rho + lr_rho * w / z_new
+            rho = (1.0 - rate) * rho + rate * w / z_new
             if rho > rho_max:
                 rho = rho_max
             s = k // n_actions
@@ -216,6 +229,7 @@ def _log_backed_up(log_least, log_e, log_y):
 def log_tilted_gauge_epoch(
     pair, s_next, log_factor, noisy, log_g, log_tilt, log_share, largest_step, members, log_z, log_total, average,
     log_weight, n_actions, steps, visits, log_rho, lr_rho, log_rho_max, rescale_every, begin, end, first=0,
+    relative=None,
 ):  # fmt: skip
     """``tilted_gauge_epoch`` in logarithms: finite for finite input of any size. Returns (log rho, true)."""
     n_states = log_z.size // n_actions
@@ -236,13 +250,17 @@ def log_tilted_gauge_epoch(
                 e += log_factor[i]
             w = log_g[k] + _log_backed_up(least, e, y[s_next[i]])
             step = min(steps[min(visits[k], last)], largest_step[k])
+            rate = lr_rho
+            if relative is not None:
+                step *= relative[i]
+                rate = lr_rho * relative[i]
             visits[k] += 1
             z_new = _log_blend(log_z[k], w - log_rho, step)
             log_z[k] = z_new
             if average:
                 high, low = max(log_total[k], z_new), min(log_total[k], z_new)
                 log_total[k] = high + math.log1p(math.exp(low - high))
-            log_rho = min(_log_blend(log_rho, w - z_new, lr_rho), log_rho_max)
+            log_rho = min(_log_blend(log_rho, w - z_new, rate), log_rho_max)
             s = k // n_actions
             y[s] = _log_row(log_z, log_weight, s * n_actions, n_actions)
             least = min(least, y[s])
