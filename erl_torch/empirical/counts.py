@@ -51,6 +51,12 @@ class WeightSums:
     squares: np.ndarray  # sum of w^2
     off: np.ndarray  # sum of w^2 (r - mean r given s')
     off_squares: np.ndarray  # sum of w^2 (r - mean r given s')^2
+    drawn: np.ndarray  # tuples of each pair, those of weight 0 too, [S*A]
+
+    def mean(self, rows: np.ndarray) -> np.ndarray:
+        """Mean weight of each pair, [S*A]; 1 without a tuple. ``rows`` [nnz]: pairs of the entries."""
+        total = np.bincount(rows, self.total, len(self.drawn))
+        return np.where(self.drawn > 0, total / np.maximum(self.drawn, 1), 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,9 +253,13 @@ def empirical_mdp(data: Experience, n_states: int, n_actions: int, counted: Tall
     """
     checks.instance("transitions", data, Experience, EXPERIENCE)
     if is_weighted(data):
-        data = weighing(data, n_states, n_actions)
-        if is_weighted(data):
-            return _weighted(data, n_states, n_actions)
+        kept = weighing(data, n_states, n_actions)
+        if is_weighted(kept):
+            drawn = np.zeros(n_states * n_actions, np.int64)
+            for chunk in data.chunks():
+                drawn += np.bincount(chunk.s * np.int32(n_actions) + chunk.a, minlength=len(drawn))
+            return _weighted(kept, n_states, n_actions, drawn)
+        data = kept
     counted = counted or tally(data, n_states, n_actions)
     visits, base = counted.visits, counted.last_reward
     n = np.maximum(visits, 1)
@@ -287,8 +297,8 @@ def entries_of(model: EmpiricalMDP, s: np.ndarray, a: np.ndarray, s_next: np.nda
     return np.asarray(np.searchsorted(keys, (s * np.int32(model.n_actions) + a) * n_states + s_next))
 
 
-def _weighted(data: Experience, n_states: int, n_actions: int) -> EmpiricalMDP:
-    """``empirical_mdp`` of tuples with weights above 0: three passes."""
+def _weighted(data: Experience, n_states: int, n_actions: int, drawn: np.ndarray) -> EmpiricalMDP:
+    """``empirical_mdp`` of tuples with weights above 0: three passes. ``drawn`` [S*A] counts those of weight 0 too."""
     seen = tally(data, n_states, n_actions)
     n_pairs, nnz, base = len(seen.visits), len(seen.counts), seen.last_reward
     row = np.repeat(np.arange(n_pairs), np.diff(seen.indptr))
@@ -327,7 +337,7 @@ def _weighted(data: Experience, n_states: int, n_actions: int) -> EmpiricalMDP:
         reward=reward.reshape(n_states, n_actions),
         reward_variance=variance.reshape(n_states, n_actions),
         reward_given_next=given,
-        weights=WeightSums(total, squares, square_off, square_spread),
+        weights=WeightSums(total, squares, square_off, square_spread, drawn),
     )
 
 

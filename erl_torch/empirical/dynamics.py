@@ -4,8 +4,9 @@ What the tuples of dynamics p say of dynamics p^ depends on what is known of p^:
 
     the ratio p^/p    ``reweighted``: each tuple gets the weight p^(s'|s,a) / p(s'|s,a), and counts for that much
                       (``erl_torch.empirical.counts``). p itself need not be known: one motor breaks, a lottery pays
-                      half as often. p^ must lead nowhere that p does not; no weight shows what was never seen. A
-                      factor of each pair cancels.
+                      half as often. p^ must lead nowhere that p does not; no weight shows what was never seen.
+                      A factor of each pair cancels; but the ratio itself has mean 1 under p, so that a mean far below
+                      tells of successors that were never seen.
     p^                ``for_dynamics``: no weights. The tuples serve for the rewards alone, and no noise of their
                       successors enters.
 
@@ -25,9 +26,11 @@ from numpy.typing import ArrayLike
 from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.empirical.counts import EmpiricalMDP, empirical_mdp, entries_of
+from erl_torch.empirical.uncertainty import LEAST_MEAN_WEIGHT
 from erl_torch.experience.experience import EXPERIENCE, Experience, check_unweighted, permitted, weighing
 from erl_torch.experience.transitions import Checksum, Transitions
 from erl_torch.mdp.tabular import TabularMDP, check_prior
+from erl_torch.notes import note
 from erl_torch.solvers.chains import reachable_from
 
 REWARDS = ("pair", "successor")  # what a reward depends on
@@ -41,7 +44,11 @@ def reweighted(experience: Experience, ratio: Ratio) -> Experience:
 
     Args:
         experience: the tuples. Weights that they have are multiplied.
-        ratio: of arrays s, a, s' [n], p^(s'|s,a) / p(s'|s,a) [n]: finite, >= 0, and up to a factor of each pair.
+        ratio: of arrays s, a, s' [n], p^(s'|s,a) / p(s'|s,a) [n]: finite and >= 0.
+
+    Notes:
+        Pairs whose mean ratio is below .5 are told (``erl_torch.notes``): most of the successors that p^ leads to were
+        never seen there.
 
     Returns:
         ``Transitions`` of ``Transitions``; of a recording, what makes the weights in every pass.
@@ -54,11 +61,25 @@ def reweighted(experience: Experience, ratio: Ratio) -> Experience:
         found: Experience = _with_ratio(experience, ratio)
     else:
         found = Reweighted(experience, ratio)
-    # Weights that cannot be used are named here, not by whoever learns.
+    # What is wrong is named here, not by whoever learns.
     sizes = np.zeros(2, np.int64)
     for chunk in found.chunks():
         sizes = np.maximum(sizes, [max(chunk.s.max(), chunk.s_next.max()), chunk.a.max()])
-    weighing(found, int(sizes[0]) + 1, int(sizes[1]) + 1)
+    n_states, n_actions = sizes + 1
+    weighing(found, int(n_states), int(n_actions))
+    n, total = np.zeros((2, n_states * n_actions))
+    for chunk in found.chunks():
+        pair = chunk.s * np.int32(n_actions) + chunk.a
+        n += np.bincount(pair, minlength=len(n))
+        total += np.bincount(pair, chunk.weight, len(n))
+    lacking = np.flatnonzero(total < LEAST_MEAN_WEIGHT * n)
+    if len(lacking):
+        pairs = np.stack(np.divmod(lacking, n_actions), 1)
+        note(
+            f"at {_named(pairs)} the mean weight is below {LEAST_MEAN_WEIGHT:g} (the first: "
+            f"{total[lacking[0]] / n[lacking[0]]:.2g} of {n[lacking[0]]:.0f} tuples), not 1: most successors under the "
+            "other dynamics were never seen there"
+        )
     return found
 
 

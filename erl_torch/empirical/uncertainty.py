@@ -48,6 +48,7 @@ Tuples with weights w: where Var / n stands above, the interval has the sandwich
 (first order: a ratio of means), times n/(n - 1) for n = Var(x)/v, Var with weights: as many draws from p^ itself would
 tell as much of x, and n stands for the visits in the likelihood and the second order. Kish's effective sample size
 (sum w)^2 / sum w^2 is that n only where w says nothing of (x - mean x)^2; it serves a ``warning`` where it is small.
+A mean weight far below 1 shows successors that were never seen, and no interval knows of them: it is withheld.
 Where the dynamics are given (``erl_torch.empirical.dynamics``) no term of p is in the interval: the rewards alone err.
 
 The bootstrap draws n(s,a) successors anew for every pair (multinomial; the reward's mean with the noise left at a given
@@ -94,6 +95,7 @@ TIED = 2.0  # standard errors between two actions' values, up to which either ma
 SMALLEST_SHARE = 1e-3  # of a Newton step
 STALLED = 0.5  # a step that leaves more of the width is the last
 UNSOLVED = 1e-6  # width, of the range of the rewards, of a relative value that is none
+LEAST_MEAN_WEIGHT = 0.5  # of a pair: p^/p has mean 1 under p, less what p^ has of successors that were never seen
 FEW_EFFECTIVE = 30.0  # draws: a smaller effective sample size of a pair that matters is told
 COMMON = 0.5  # share of the states; a successor met from more of them may be met from any
 
@@ -339,7 +341,7 @@ def _plug_in(
         bias=bias,
         untried=(0.0, untried),
         smallest_visits=int(_effective(model).flat[counts].min()) if counts.size else None,
-        withheld=_same_reward(model, empirical) or _withheld(total, bias, untried),
+        withheld=_same_reward(model, empirical) or _unseen(model, d) or _withheld(total, bias, untried),
         warning="; ".join(filter(None, (_warning(model, rows, counts), _few_effective(model, counts)))),
     )
     if estimate.withheld:  # the correction cannot be trusted
@@ -718,6 +720,22 @@ def _effective(model: EmpiricalMDP) -> np.ndarray:
     total, squares = (np.bincount(rows, x, model.visits.size) for x in (model.weights.total, model.weights.squares))
     return np.asarray(np.divide(total**2, squares, out=np.zeros_like(total), where=squares > 0)).reshape(
         model.visits.shape
+    )
+
+
+def _unseen(model: EmpiricalMDP, d: np.ndarray) -> str:
+    """That pairs where the process spends time, ``d`` [S, A], lack most of the other dynamics' successors."""
+    if model.weights is None or model.given:
+        return ""
+    rows = np.repeat(np.arange(model.visits.size), np.diff(model.transition.indptr))
+    lacking = np.where(model.weights.mean(rows) < LEAST_MEAN_WEIGHT, d.ravel(), 0.0)
+    if not lacking.sum() > COUNTED_SHARE:
+        return ""
+    worst = int(np.argmax(lacking))
+    s, a = divmod(worst, model.n_actions)
+    return (
+        f"at state {s}, action {a} the mean weight of {model.weights.drawn[worst]} tuples is "
+        f"{model.weights.mean(rows)[worst]:.2g}, not 1: most successors under the other dynamics were never seen"
     )
 
 

@@ -183,7 +183,7 @@ class Checksum:
     def of(self, chunk: Transitions) -> int:
         """The checksum of all chunks so far, this one included."""
         for name, column in chunk.arrays().items():
-            self.columns[name] = zlib.crc32(memoryview(column), self.columns.get(name, 0))
+            self.columns[name] = zlib.crc32(column.data, self.columns.get(name, 0))
         return zlib.crc32(np.array(list(self.columns.values()), "<u4").tobytes())
 
 
