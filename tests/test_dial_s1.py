@@ -1,4 +1,4 @@
-"""Algorithm S1 at any optimism: against value iteration of its own, exact iterations, the listing, and its special cases."""
+"""Algorithm S1 at any optimism: against value iteration, exact iterations, the listing, and its special cases."""
 
 import math
 from dataclasses import replace
@@ -69,7 +69,10 @@ def exact_lines(p, r, prior, beta, optimism, n):
         theta = -np.log(rho) / beta - delta.max()
         mean_psi = power ** (1 / (1 - optimism)) if optimism != 1 else np.ones_like(power)
         found.append(
-            dict(psi=psi, mean_psi=mean_psi, mean_log_psi=log_mean, delta=delta, rho=rho, u=u, policy=policy, theta=theta)
+            {
+                "psi": psi, "mean_psi": mean_psi, "mean_log_psi": log_mean, "delta": delta,
+                "rho": rho, "u": u, "policy": policy, "theta": theta,
+            }
         )  # fmt: skip
         psi = 1 / (prior * u).sum(1)
     return found
@@ -158,7 +161,7 @@ def test_expected_update_vanishes_at_the_exact_iterations(implementation, optimi
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("optimism", (1.5, 1.0, 0.5, -0.5, -1.0))
+@pytest.mark.parametrize("optimism", [1.5, 1.0, 0.5, -0.5, -1.0])
 def test_streams_come_near_the_exact_solution(optimism):
     mdp, prior, p = small(2, 3, 2)
     data = collect(mdp, 1, 100_000, 0, prior_policy=prior)
@@ -257,7 +260,7 @@ def test_optimism_0_is_the_paper_and_nearby_is_near():
     np.testing.assert_allclose(near.policy, plain.policy, atol=1e-8)
 
 
-@pytest.mark.parametrize("kind", (AlgorithmS1, ListedS1))
+@pytest.mark.parametrize("kind", [AlgorithmS1, ListedS1])
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
 def test_optimism_1_is_plain_u_learning(kind, implementation):
     """Biasing iteration 0, again and again: b = 1, delta = 0, and no psi phase (whose means of 1 are 1 to rounding)."""
@@ -307,7 +310,7 @@ def test_bad_optimism_is_named(value):
 
 
 @pytest.mark.parametrize("implementation", IMPLEMENTATIONS)
-@pytest.mark.parametrize("optimism", (-1e4, 1e4))
+@pytest.mark.parametrize("optimism", [-1e4, 1e4])
 def test_leaving_the_numbers_is_named(implementation, optimism):
     mdp, _, _ = small(3)
     data = random_stream(np.random.default_rng(0), mdp, 2000)
@@ -332,8 +335,8 @@ def same(one, other):
 SWEEP = (1.5, 1.0, 0.5, 0.1, 0.0, -0.1, -0.5, -1e4)  # the last leaves the numbers
 
 
-@pytest.mark.parametrize("source", ("shared", "noisy", "recorded", "kept", "again"))
-@pytest.mark.parametrize("layout", ("lanes", "tables"))
+@pytest.mark.parametrize("source", ["shared", "noisy", "recorded", "kept", "again"])
+@pytest.mark.parametrize("layout", ["lanes", "tables"])
 def test_replicas_at_any_optimism_come_out_as_alone(source, layout):
     mdp, prior, _ = small(4)
     rng, n = np.random.default_rng(0), len(SWEEP)
@@ -365,7 +368,7 @@ def test_torch_operations_are_the_compiled_loop():
     np.testing.assert_allclose(by_torch.theta, compiled.theta, rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("optimism", (1.5, 1.0, 0.5, -0.5))
+@pytest.mark.parametrize("optimism", [1.5, 1.0, 0.5, -0.5])
 def test_goes_on_from_any_state_with_the_same_bits(optimism):
     mdp, _, _ = small(4)
     data = random_stream(np.random.default_rng(1), mdp, 500)

@@ -34,9 +34,9 @@ the dynamics. With V = -log(psi)/beta, C V = (1/kappa) log <exp(kappa V)> and ka
     line 4     b = psi(s')^(1-lam) / <psi^(1-lam)>
     line 5     delta = (log <psi^(1-lam)> - (1-lam) l) / beta: >= 0 for lam <= 1, <= 0 above
 
-At 0 this is the listing. At 1 b = 1 and delta = 0: each biasing iteration is plain U-learning, and there is no psi phase.
-Lines 6-14 are the listing's at every optimism, rho = exp(-beta) of line 8 with them. Only l counts in lines 9-11; <psi^(1-lam)>
-cancels but for Delta, a constant.
+At 0 this is the listing. At 1 b = 1 and delta = 0: each biasing iteration is plain U-learning, and there is no psi
+phase. Lines 6-14 are the listing's at every optimism, rho = exp(-beta) of line 8 with them. Only l counts in lines
+9-11; <psi^(1-lam)> cancels but for Delta, a constant.
 
 Exact rearrangements used by ``implementation="fast"`` (the literal twin is ``erl_torch.learners.s1.listing``)
 
@@ -57,7 +57,8 @@ which made the published Figure 5; ``ListedS1`` is the same class with the listi
    mean 1 after each epoch.
 3. ``clip_rho``: rho <= max(1, exp(beta max r)) after each update. The script clips at 1, which holds
    for r <= 0 only; the wider bound holds for any reward and optimism, because sum_s' p b = 1 and delta <= Delta,
-   once the means of lines 2-3 have converged; before, the clip only keeps rho near where its limit lies (docs/theory.md, 5).
+   once the means of lines 2-3 have converged; before, the clip only keeps rho near where its limit lies
+   (docs/theory.md, 5).
 4. ``rho_init``: "reset" sets rho = exp(-beta) in every biasing iteration (line 8), "carry" only once
    (the script).
 5. <psi> and <log psi> are carried over between biasing iterations (line 1 stands before the loop).
@@ -456,7 +457,8 @@ class AlgorithmS1(StreamLearner[S1State, S1Stream]):
             epochs += 1
             before, log_before = mean_psi.clone(), mean_log_psi.clone()
             assert isinstance(stream.data, Transitions)
-            listing.psi_epoch(stream.data, *map(_walkable, of_psi), *map(_walkable, means), self.lr_psi)
+            tables = [_walkable(table) for table in (*of_psi, *means)]
+            listing.psi_epoch(stream.data, tables[0], tables[1], tables[2], tables[3], self.lr_psi)
             mean_psi, mean_log_psi = self._of_running(*means)
             error = max(
                 float(((mean_psi - before).abs() / before).max()),
@@ -609,7 +611,7 @@ def gauge(psi: np.ndarray, optimism: float) -> np.ndarray:
     if optimism == 0.0:
         return psi
     exponent = (1 - optimism) * np.log(psi)
-    return np.exp(exponent - exponent.max())
+    return np.exp(exponent - exponent.max())  # type: ignore[no-any-return]
 
 
 def gains(

@@ -341,7 +341,7 @@ class Engine:
         n = len(learners)
 
         def prepared(r: int) -> S1Stream:
-            # Streams are the same at any beta and optimism, but for what is made of beta below; at this one nothing overflows.
+            # Streams are the same at any beta and optimism, but for what is made of beta below; here nothing overflows.
             learner: AlgorithmS1 = replace(learners[r], beta=checks.SMALLEST_BETA, optimism=0.0)
             return learner.prepare(tuples_of(self.experience, r, self.prior), self.n_states, self.n_actions)
 

@@ -46,7 +46,9 @@ def u_epoch(
 ) -> tuple[float, int]:
     """Lines 9-11 over the whole stream; u [S, A] changes in place.
 
-    Where optimism is not 0, psi^(1-optimism) and its mean stand for psi and mean_psi. Returns (rho, t): t = N, or the first tuple whose update is not a positive finite number.
+    Where optimism is not 0, psi^(1-optimism) and its mean stand for psi and mean_psi.
+
+    Returns (rho, t): t = N, or the first tuple whose update is not a positive finite number.
     """
     columns = (data.s, data.a, data.r, data.s_next, data.a_next)
     for t, (s, a, r, s_next, a_next) in enumerate(zip(*(c.tolist() for c in columns), strict=True)):
