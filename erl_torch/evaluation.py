@@ -34,6 +34,7 @@ class Evaluation(NamedTuple):
     reward_per_step: float  # exact over the horizon where the model is known, else sampled
     objective: float  # stationary reward rate - KL/beta, as ``objective``, where the model is known; else sampled
     success_rate: float = np.nan  # of episodes within the horizon; NaN where it is not known what a success is
+    objective_real: float = np.nan  # the objective at optimism 0, in the real world, where that of the run is another
 
 
 def evaluate(
@@ -48,6 +49,8 @@ def evaluate(
     mean_return: Callable[[np.ndarray], float] | None = None,
     success_rate: Callable[[np.ndarray], float] | None = None,
     ends: EndRule | None = None,
+    *,
+    optimism: float = 0.0,
 ) -> Evaluation:
     """Evaluate ``policy`` [S, A]: on the model where it is known, by playing episodes otherwise.
 
@@ -67,11 +70,14 @@ def evaluate(
         success_rate: computes the success rate of a policy [S, A]; None counts episodes played.
         ends: which ends of episodes played are failures. What it adds to their rewards counts in reward per step and
             objective, not in the return. None: it is not known.
+        optimism: 1 optimistic (control as inference), 0 right, negative robust, as in ``solve_soft_bellman``; it
+            counts in the objective alone, which is NaN at any other than 0 where no model is known.
 
     Raises:
         InputError: an argument out of range, a policy or prior that is not [S, A], or a model of other sizes.
     """
     beta = checks.temperature("beta", beta)
+    optimism = checks.optimism("optimism", optimism, beta)
     n_episodes, horizon = checks.at_least("n_episodes", n_episodes, 1), checks.at_least("horizon", horizon, 1)
     checks.memory("n_episodes", n_episodes, 8 * n_episodes, "the returns of all episodes")
     checks.instance("rng", rng, np.random.Generator, "a generator, as numpy.random.default_rng(0)")
@@ -100,10 +106,10 @@ def evaluate(
         sampled = _evaluate_by_playing(source, table, prior, beta, rng, n_episodes, horizon, ends, masked)
         played, succeeded = sampled.mean_return, sampled.success_rate
     if model is None:
-        return sampled
+        return sampled if optimism == 0.0 else sampled._replace(objective=np.nan)
     if success_rate is not None:
         succeeded = success_rate(table)
-    figures = reward_per_step(model, table, horizon), objective(model, table, prior, beta)
+    figures = reward_per_step(model, table, horizon), objective(model, table, prior, beta, optimism=optimism)
     return Evaluation(played, *figures, succeeded)
 
 
@@ -142,16 +148,16 @@ class Judge:
         )
         return float(total) / self.horizon
 
-    def objective(self, policy: np.ndarray, beta: float) -> float:
-        """``objective`` of a policy [S, A]."""
-        if self._small and ((policy > 0) | ~self.mdp.allowed).all():
+    def objective(self, policy: np.ndarray, beta: float, *, optimism: float = 0.0) -> float:
+        """``objective`` of a policy [S, A]; 1 optimistic (control as inference), 0 right, negative robust."""
+        if optimism == 0.0 and self._small and ((policy > 0) | ~self.mdp.allowed).all():
             chain = sp.csr_array((self._chain(policy), self._columns, self._rows))
             share, sound = solvers_kernels.gth(chain[self._inside][:, self._inside].toarray())
             parts = (self.mdp.transition, self.mdp.reward, self.prior, beta, policy)
             gains = policy_gains(*parts, np.zeros(len(policy)))
             if sound and np.isfinite(gains).all() and np.abs(policy.sum(1) - 1).max() <= 2e-15:
                 return float(share @ one_step_worth(*gains)[self._inside])
-        return objective(self.mdp, policy, self.prior, beta)
+        return objective(self.mdp, policy, self.prior, beta, optimism=optimism)
 
     def _chain(self, policy: np.ndarray) -> np.ndarray:
         chain = np.empty(len(self._columns))

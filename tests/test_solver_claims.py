@@ -13,6 +13,7 @@ from many_digits import problem
 from erl_torch import InputError, Status, TabularMDP, certify, iterate_biasing, solve_biasing, solve_soft_bellman
 from erl_torch.solvers import soft_bellman
 from erl_torch.solvers.biasing import PATIENCE
+from erl_torch.solvers.horizons import Backup
 from erl_torch.solvers.newton import NewtonPattern
 from erl_torch.solvers.problem import BellmanProblem
 from erl_torch.solvers.result import exact_solution
@@ -88,7 +89,9 @@ def test_the_cut_is_moved_off_a_state_that_is_hardly_ever_met(n, back):
     log_y = np.random.default_rng(n).standard_normal(n)
     mdp = TabularMDP(p[:, None] / p.sum(1)[:, None, None], np.zeros((n, 1)), np.eye(n)[0])
     log_weight = log_y - np.log(dense(mdp)[:, 0] @ np.exp(log_y))
-    found = NewtonPattern.of(BellmanProblem.of(mdp, 1.0)).eigenvector(log_weight[:, None], 0, 1e-13, 60)
+    found = NewtonPattern.of(BellmanProblem.of(mdp, 1.0)).eigenvector(
+        log_weight[:, None], np.log(mdp.transition.data), 0, 1e-13, 60
+    )
     assert found is not None
     h, (low, high), _ = found
     np.testing.assert_allclose(h - h[0], log_y - log_y[0], atol=1e-11)
@@ -213,13 +216,11 @@ def test_the_state_with_the_narrowest_bounds_is_kept(monkeypatch):
     problem = BellmanProblem.of(mdp, 5.0)
     good = solve_soft_bellman(mdp, 5.0)
     value = good.value.numpy()
-    states = [
-        soft_bellman._state(problem, v, i + 1, np.inf) for i, v in enumerate((0.9 * value, value + 1.0, 0 * value))
-    ]
+    states = [Backup(problem).state(v, i + 1, np.inf) for i, v in enumerate((0.9 * value, value + 1.0, 0 * value))]
     monkeypatch.setattr(soft_bellman, "iterate_soft_bellman", lambda *_: iter(states))
     found = soft_bellman.solve_problem(problem, mdp)
     np.testing.assert_allclose(found.policy, good.policy, atol=1e-9)
-    monkeypatch.setattr(soft_bellman, "_undiscounted", lambda *_: iter(states))
+    monkeypatch.setattr(soft_bellman, "undiscounted", lambda *_: iter(states))
     kept, bounds = soft_bellman.polish(problem, np.zeros(4), (-np.inf, np.inf), 1e-300)
     np.testing.assert_array_equal(kept, states[1].value)
     assert bounds[1] - bounds[0] <= states[1].width

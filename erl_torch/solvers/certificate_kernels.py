@@ -74,6 +74,68 @@ def _soft_maximum(q, weight, beta, choice):
 
 
 @numba.njit(cache=True, error_model="numpy", nogil=True)
+def _longest(indptr):
+    n = 0
+    for k in range(indptr.size - 1):
+        n = max(n, indptr[k + 1] - indptr[k])
+    return n
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def _entropic_drift(indices, data, first, last, value, s, kappa, moved, weight, tilted):
+    """(C V - V(s), bound on its rounding) over one CSR row, C V = (1/kappa) log sum_s' p exp(kappa V(s')), kappa not 0.
+
+    Where little moves, log1p of a sum over s' other than s, as in ``_drift``: a tiny kappa, or a state that is rarely
+    left, costs no digit. ``_soft_maximum`` of +-(V(s') - V(s)) else. The last three [longest row]: overwritten.
+    """
+    epsilon = 2.0**-52
+    n = last - first
+    if n == 0:
+        return 0.0, 0.0
+    total, lost, size, spoilt = 0.0, 0.0, 0.0, 0.0
+    for m in range(first, last):
+        if indices[m] != s:
+            t = kappa * (value[indices[m]] - value[s])
+            x = data[m] * math.expm1(t)
+            size += abs(x)
+            spoilt += abs(x) * (2.0 + max(t, 0.0))  # the condition of expm1
+            new = total + x
+            lost += (total - new) + x if abs(total) >= abs(x) else (x - new) + total
+            total = new
+    if size <= 0.5:
+        drift = math.log1p(total + lost) / kappa
+        error = (5.0 * epsilon * spoilt + (n + 1) * 1e-322) * 1.1 / ((1.0 - size) * abs(kappa))
+        return drift, error + 3.0 * epsilon * abs(drift)
+    sign = 1.0 if kappa > 0.0 else -1.0
+    far = 0.0
+    for m in range(first, last):
+        moved[m - first] = sign * (value[indices[m]] - value[s])
+        weight[m - first] = data[m]
+        far = max(far, abs(moved[m - first]))
+    maximum, rounding = _soft_maximum(moved[:n], weight[:n], abs(kappa), tilted[:n])
+    # Of the differences: as far as each is weighted, where that is known well.
+    off = far
+    if abs(kappa) * far * epsilon < 0.1:
+        off = n * 1e-300 * far
+        for j in range(n):
+            off += 1.3 * tilted[j] * abs(moved[j])
+    return sign * maximum, rounding + epsilon * off
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def certainty_rows(indptr, indices, data, n_actions, kappa, value, certain):
+    """Fills certain [S*A] with C V, kappa not 0; 0 where a row is empty."""
+    n = _longest(indptr)
+    moved, weight, tilted = np.empty(n), np.empty(n), np.empty(n)
+    for k in range(indptr.size - 1):
+        first, last, s = indptr[k], indptr[k + 1], k // n_actions
+        certain[k] = 0.0
+        if last > first:
+            drift, _ = _entropic_drift(indices, data, first, last, value, s, kappa, moved, weight, tilted)
+            certain[k] = value[s] + drift
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
 def soft_rows(q, prior, beta, backed_up, policy):
     """backed_up(s) = (1/beta) log sum_a prior exp(beta q) and the policy that attains it; q, prior, policy [S, A]."""
     for s in range(q.shape[0]):
@@ -81,8 +143,8 @@ def soft_rows(q, prior, beta, backed_up, policy):
 
 
 @numba.njit(cache=True, error_model="numpy", nogil=True)
-def gain_rows(indptr, indices, data, reward, prior, beta, value, gain, low, high, policy):
-    """gain = TV - V [S] with low <= gain <= high in exact arithmetic, and pi_V [S, A].
+def gain_rows(indptr, indices, data, reward, prior, beta, kappa, value, gain, low, high, policy):
+    """gain = TV - V [S] with low <= gain <= high in exact arithmetic, and pi_V [S, A]; E V at kappa 0, else C V.
 
     The rows of the transition matrix (CSR) and of the prior count as divided by their sums, which are 1 within 1e-15.
     A gain that is no finite number has infinite bounds.
@@ -90,13 +152,20 @@ def gain_rows(indptr, indices, data, reward, prior, beta, value, gain, low, high
     n_states, n_actions = reward.shape
     epsilon = 2.0**-52
     q, error, scratch = np.empty(n_actions), np.empty(n_actions), np.empty(n_actions)
+    n = _longest(indptr) if kappa != 0.0 else 0
+    moved, weight, tilted = np.empty(n), np.empty(n), np.empty(n)
     for s in range(n_states):
         top = -np.inf
         for a in range(n_actions):
             k = s * n_actions + a
-            drift, size = _drift(indices, data, indptr[k], indptr[k + 1], value, s)
+            first, last = indptr[k], indptr[k + 1]
+            if kappa == 0.0:
+                drift, size = _drift(indices, data, first, last, value, s)
+                off = 10.0 * epsilon * size
+            else:
+                drift, off = _entropic_drift(indices, data, first, last, value, s, kappa, moved, weight, tilted)
             q[a] = reward[s, a] + drift
-            error[a] = 10.0 * epsilon * size + epsilon * abs(q[a]) + 1e-320 * (1 + indptr[k + 1] - indptr[k])
+            error[a] = off + epsilon * abs(q[a]) + 1e-320 * (1 + last - first)
             if prior[s, a] > 0.0:
                 top = max(top, q[a])
         for a in range(n_actions):
@@ -156,19 +225,27 @@ def _relative_entropy(policy, prior):
 
 
 @numba.njit(cache=True, error_model="numpy", nogil=True)
-def policy_gain_rows(indptr, indices, data, reward, prior, beta, policy, value, low, high):
-    """low <= T_pi V - V <= high [S] in exact arithmetic, T_pi V = sum_a pi (r + E V - log(pi/pi0)/beta).
+def policy_gain_rows(indptr, indices, data, reward, prior, beta, kappa, policy, value, low, high):
+    """low <= T_pi V - V <= high [S] in exact arithmetic, T_pi V = sum_a pi (r + E V - log(pi/pi0)/beta); C V for E V
+    where kappa is not 0.
 
     Rows count as divided by their sums, as in ``gain_rows``.
     """
     n_states, n_actions = reward.shape
     epsilon = 2.0**-52
+    n = _longest(indptr) if kappa != 0.0 else 0
+    moved_by, weight, tilted = np.empty(n), np.empty(n), np.empty(n)
     for s in range(n_states):
         total, mean, lost, error, size = 0.0, 0.0, 0.0, 0.0, 0.0
         for a in range(n_actions):
             if policy[s, a] > 0.0:
                 k = s * n_actions + a
-                drift, moved = _drift(indices, data, indptr[k], indptr[k + 1], value, s)
+                first, last = indptr[k], indptr[k + 1]
+                if kappa == 0.0:
+                    drift, moved = _drift(indices, data, first, last, value, s)
+                    off = 10.0 * epsilon * moved
+                else:
+                    drift, off = _entropic_drift(indices, data, first, last, value, s, kappa, moved_by, weight, tilted)
                 q = reward[s, a] + drift
                 total += policy[s, a]
                 x = policy[s, a] * q
@@ -176,7 +253,7 @@ def policy_gain_rows(indptr, indices, data, reward, prior, beta, policy, value, 
                 new = mean + x
                 lost += (mean - new) + x if abs(mean) >= abs(x) else (x - new) + mean
                 mean = new
-                error += policy[s, a] * (10.0 * epsilon * moved + 1e-320 * (1 + indptr[k + 1] - indptr[k])) + 1e-320
+                error += policy[s, a] * (off + 1e-320 * (1 + last - first)) + 1e-320
         least, most = _relative_entropy(policy[s], prior[s])
         mean = (mean + lost) / total
         error = 2.0 * error + (n_actions + 12) * epsilon * size

@@ -9,6 +9,10 @@ whatever the chain. In the second, minimum and maximum over the states that pi c
 TV - V is the one-step regularised reward of pi_V with the difference V(s') - V(s) added, which averages to nothing
 under a stationary distribution; and of all policies pi_V has the largest such reward in every state.
 
+With optimism, C V = (1/kappa) log sum_s' p exp(kappa V(s')) stands for E V, kappa = optimism * beta: T and T_pi stay
+monotone and commute with constants, so both lines hold, with J(pi) the limit of T_pi^N 0 / N, in every state. But
+states that are left for ever count in the second then (``nested.py``).
+
 The compiled rows (``certificate_kernels.gain_rows``, ``certificate_kernels.policy_gain_rows``) return each gain with
 a lower and an upper bound that rounding cannot leave. E V - V(s) is a sum of p (V(s') - V(s)) over s' other than s,
 so that no digit is lost where a state is rarely left. The error of an action counts as far as the action is chosen
@@ -53,13 +57,22 @@ class Gains(NamedTuple):
         return -float(self.high.max()), -float(self.low.min())
 
 
-def gains(transition: sp.csr_array, reward: np.ndarray, prior: np.ndarray, beta: float, value: np.ndarray) -> Gains:
-    """TV - V of ``value`` [S] for a transition matrix [S*A, S], reward and prior [S, A]."""
+def gains(
+    transition: sp.csr_array,
+    reward: np.ndarray,
+    prior: np.ndarray,
+    beta: float,
+    value: np.ndarray,
+    kappa: float = 0.0,
+) -> Gains:
+    """TV - V of ``value`` [S] for a transition matrix [S*A, S], reward and prior [S, A]; kappa as in C V above."""
     n_states = len(value)
     gain, low, high = np.empty(n_states), np.empty(n_states), np.empty(n_states)
     policy = np.empty(reward.shape)
     p = transition
-    certificate_kernels.gain_rows(p.indptr, p.indices, p.data, reward, prior, beta, value, gain, low, high, policy)
+    certificate_kernels.gain_rows(
+        p.indptr, p.indices, p.data, reward, prior, beta, kappa, value, gain, low, high, policy
+    )
     return Gains(gain, low, high, policy)
 
 
@@ -70,12 +83,25 @@ def policy_gains(
     beta: float,
     policy: np.ndarray,
     value: np.ndarray,
+    kappa: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray]:
     """(low, high) [S] of T_pi V - V, as ``gains``, for any policy [S, A]; -infinite where it leaves the prior."""
     low, high = np.empty(len(value)), np.empty(len(value))
     p = transition
-    certificate_kernels.policy_gain_rows(p.indptr, p.indices, p.data, reward, prior, beta, policy, value, low, high)
+    certificate_kernels.policy_gain_rows(
+        p.indptr, p.indices, p.data, reward, prior, beta, kappa, policy, value, low, high
+    )
     return low, high
+
+
+def certainty_equivalent(transition: sp.csr_array, n_actions: int, kappa: float, value: np.ndarray) -> np.ndarray:
+    """C V [S*A] = (1/kappa) log sum_s' p exp(kappa V(s')) of ``value`` [S], E V at kappa 0; 0 where a row is empty."""
+    if kappa == 0.0:
+        return np.asarray(transition @ value)
+    certain = np.empty(transition.shape[0])
+    p = transition
+    certificate_kernels.certainty_rows(p.indptr, p.indices, p.data, n_actions, kappa, value, certain)
+    return certain
 
 
 def soft_backup(q: np.ndarray, prior: np.ndarray, beta: float) -> tuple[np.ndarray, np.ndarray]:

@@ -11,7 +11,7 @@ from erl_torch.checks import InputError
 from erl_torch.mdp.tabular import TabularMDP, check_policy
 from erl_torch.solution import Solution, Status
 from erl_torch.solvers import solve_soft_bellman
-from erl_torch.solvers.policy import kl_per_state, policy_chain, stationary_distribution
+from erl_torch.solvers.policy import kl_per_state, objective, policy_chain, stationary_distribution
 
 
 class Optimum(NamedTuple):
@@ -23,9 +23,12 @@ class Optimum(NamedTuple):
     stationary: np.ndarray  # [S], of that policy
 
 
-def solve_optimum(mdp: TabularMDP, beta: float, prior_policy: ArrayLike | None = None) -> Optimum:
-    """The optimum of ``mdp``. Raises InputError unless the solver has proven it."""
-    solution = solve_soft_bellman(mdp, beta, prior_policy)
+def solve_optimum(
+    mdp: TabularMDP, beta: float, prior_policy: ArrayLike | None = None, *, optimism: float = 0.0
+) -> Optimum:
+    """The optimum of ``mdp``; optimism as in ``solve_soft_bellman``: 1 optimistic (control as inference), 0 right,
+    negative robust. Raises InputError unless the solver has proven it."""
+    solution = solve_soft_bellman(mdp, beta, prior_policy, optimism=optimism)
     if solution.status is not Status.CONVERGED:
         raise InputError(
             "model",
@@ -44,8 +47,20 @@ def solve_optimum(mdp: TabularMDP, beta: float, prior_policy: ArrayLike | None =
     )
 
 
-def measure(mdp: TabularMDP, optimum: Optimum, solution: Solution, beta: float) -> dict[str, float]:
-    """How far ``solution`` is from ``optimum``.
+def measure(
+    mdp: TabularMDP,
+    optimum: Optimum,
+    solution: Solution,
+    beta: float,
+    prior_policy: ArrayLike | None = None,
+    *,
+    optimism: float = 0.0,
+) -> dict[str, float]:
+    """How far ``solution`` is from ``optimum``; long runs are those of the model.
+
+    Args:
+        prior_policy: [S, A], of the optimum; None is uniform. It counts where optimism is not 0 only.
+        optimism: that of the optimum; 1 optimistic (control as inference), 0 right, negative robust.
 
     Returns:
         gap, g* - J(policy), reward per step; kl, KL(optimal policy || policy), nats, averaged over the long run of the
@@ -57,8 +72,12 @@ def measure(mdp: TabularMDP, optimum: Optimum, solution: Solution, beta: float) 
     with np.errstate(divide="ignore", invalid="ignore"):
         loss = np.where(policy > 0, policy * (np.log(policy) - optimum.log_policy), 0.0).sum(1)
     kl = kl_per_state(optimum.policy, policy)
+    gap = max(_mean(own, loss), 0.0) / beta
+    if optimism != 0.0:  # the identity behind that holds at 0
+        prior = check_policy("prior_policy", prior_policy, mdp.n_states, mdp.n_actions, mdp.allowed)
+        gap = max(-optimum.theta - objective(mdp, policy, prior, beta, optimism=optimism), 0.0)
     return {
-        "gap": max(_mean(own, loss), 0.0) / beta,
+        "gap": gap,
         "kl": _mean(optimum.stationary, kl),
         "kl_states": float(kl.mean()),
         "theta_error": np.nan if solution.theta is None else abs(solution.theta - optimum.theta),

@@ -11,8 +11,9 @@ from typing import NamedTuple
 import numpy as np
 import scipy.sparse as sp
 
+from erl_torch import checks
 from erl_torch.mdp.tabular import TabularMDP
-from erl_torch.solvers import certificates, chains, kernels
+from erl_torch.solvers import chains, kernels, nested
 from erl_torch.solvers.chains import long_run
 
 
@@ -63,10 +64,16 @@ def induced_distribution(mdp: TabularMDP, policy: np.ndarray, horizon: int | Non
     return share / horizon
 
 
-def objective(mdp: TabularMDP, policy: np.ndarray, prior: np.ndarray, beta: float) -> float:
-    """J(pi): stationary reward rate minus KL/beta, from the start distribution; reward per step.
+def objective(mdp: TabularMDP, policy: np.ndarray, prior: np.ndarray, beta: float, *, optimism: float = 0.0) -> float:
+    """J(pi) from the start distribution, reward per step: the stationary reward rate minus KL/beta at optimism 0.
 
     Exact but for rounding. Where products of probabilities underflow, it may be anywhere between the bounds that
-    ``certificates.objective`` gives with it.
+    ``nested.objective`` gives with it.
+
+    Args:
+        optimism: 1 optimistic (control as inference), 0 right, negative robust, as in ``nested.objective``; there is
+            also what J is where it depends on the start.
     """
-    return certificates.objective(mdp.transition, mdp.reward, prior, beta, policy, mdp.start).value
+    return nested.objective(
+        mdp.transition, mdp.reward, prior, beta, policy, mdp.start, optimism=checks.optimism("optimism", optimism, beta)
+    ).value

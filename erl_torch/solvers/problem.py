@@ -1,6 +1,7 @@
 """``BellmanProblem``, the problem that the solvers solve: an MDP on the states that count, with beta and prior.
 
-    TV(s) = (1/beta) log sum_a prior(a|s) exp(beta (r(s,a) + E_{s'|s,a} V(s')))
+    TV(s) = (1/beta) log sum_a prior(a|s) exp(beta (r(s,a) + C V(s,a))),    kappa = optimism * beta,
+    C V(s,a) = (1/kappa) log E_{s'|s,a} exp(kappa V(s')),    E_{s'|s,a} V(s') at optimism 0
 
 is its soft Bellman backup; ``erl_torch.solvers.certificates`` has the bounds that V and TV prove.
 
@@ -21,7 +22,7 @@ from numpy.typing import ArrayLike
 from erl_torch import checks
 from erl_torch.mdp.tabular import TabularMDP, check_prior
 from erl_torch.solvers import kernels
-from erl_torch.solvers.certificates import Gains, gains
+from erl_torch.solvers.certificates import Gains, certainty_equivalent, gains
 from erl_torch.solvers.chains import Elimination, RegenerativeLU, SingularChainError, classes, reachable_from
 
 
@@ -107,16 +108,31 @@ class BellmanProblem:
 
     def gains(self, value: np.ndarray) -> Gains:
         """TV - V of ``value`` [n], with bounds on its rounding."""
-        return gains(self.transition, self.reward, self.prior, self.beta, value)
+        return gains(self.transition, self.reward, self.prior, self.beta, value, self.kappa)
 
     @cached_property
     def classes(self) -> tuple[np.ndarray, np.ndarray]:
         """(label, closed) of the classes of states under policies with full support."""
         return classes(state_graph(self.transition, self.n_actions))
 
+    def certainty_equivalent(self, value: np.ndarray) -> np.ndarray:
+        """C V = (1/kappa) log sum_s' p exp(kappa V(s')), E V at optimism 0, of ``value`` [n]: [n*A]; 0 where the prior
+        is 0."""
+        return certainty_equivalent(self.transition, self.n_actions, self.kappa, value)
+
     def action_value(self, value: np.ndarray) -> np.ndarray:
-        """r + E V, [n, A]; 0 where the prior is 0."""
-        return np.asarray(self.reward + (self.transition @ value).reshape(self.reward.shape))
+        """r + C V, r + E V at optimism 0, [n, A]; 0 where the prior is 0."""
+        return np.asarray(self.reward + self.certainty_equivalent(value).reshape(self.reward.shape))
+
+    def tilted(self, value: np.ndarray) -> np.ndarray | None:
+        """q_V(s'|s,a) = p exp(kappa (V(s') - C V)) as CSR data, the derivative of C at ``value`` [n]; None: p itself,
+        at optimism 0. Entries may underflow to 0 (``support_lost``)."""
+        return self.tilt(self.kappa * value)[2] if self.kappa else None
+
+    def support_lost(self, value: np.ndarray) -> bool:
+        """Whether an entry of q_V leaves the normal numbers: M_V has lost support then, and its root is no bound."""
+        tilted = self.tilted(value)
+        return tilted is not None and bool((tilted < np.finfo(np.float64).tiny).any())
 
     @cached_property
     def pattern(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -138,12 +154,15 @@ class BellmanProblem:
         kernels.chain_of(p.data if tilted is None else tilted, slot, policy.reshape(-1), p.indptr, data)
         return sp.csr_array((data, ind, ptr), shape=(self.n_states, self.n_states))
 
-    def regeneration(self, policy: np.ndarray, ref: int | None = None) -> RegenerativeLU:
-        """The LU of the policy's chain, cut at a state that it visits often. Raises SingularChainError."""
+    def regeneration(
+        self, policy: np.ndarray, ref: int | None = None, tilted: np.ndarray | None = None
+    ) -> RegenerativeLU:
+        """The LU of the policy's chain, cut at a state that it visits often; ``tilted`` as in ``chain``. Raises
+        SingularChainError."""
         ref = self.regeneration_state() if ref is None else ref
         if ref is None:
             raise SingularChainError("several closed classes")
-        return RegenerativeLU.adapted(self.chain(policy), ref, self.elimination)
+        return RegenerativeLU.adapted(self.chain(policy, tilted), ref, self.elimination)
 
     def tilt(self, h: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(log <exp h> [n*A], KL(tilted || p) [n*A], p exp(h)/<exp h> as CSR data)."""

@@ -10,8 +10,15 @@ from numpy.typing import ArrayLike
 
 from erl_torch.mdp.tabular import check_policy
 from erl_torch.solution import Solution, Status
-from erl_torch.solvers.certificates import objective, policy_gains, soft_backup
+from erl_torch.solvers.certificates import policy_gains, soft_backup
+from erl_torch.solvers.nested import objective
 from erl_torch.solvers.problem import BellmanProblem
+
+ROUNDING_WIDTH = 1e-6  # of bounds, relative to the reward range: what is wider has another cause
+SEVERAL_RATES = (
+    "below optimism 0 dynamics that are feared may keep the process where it starts, and the optimal rate then depends "
+    "on the start: raise optimism"
+)
 
 
 class Sized(Protocol):
@@ -37,12 +44,14 @@ def exact_solution(
 ) -> Solution:
     """The solution that belongs to ``value`` [n], on the problem's states; theta is the middle of the bounds.
 
-    With status REDUCIBLE, theta* may differ from state to state: there is no theta, and the bounds hold for each.
+    With status REDUCIBLE or NO_SINGLE_RATE, theta* may differ from state to state: there is no theta, and the bounds
+    hold for each.
     """
     beta = problem.beta
     q = problem.action_value(value)
     backed_up, policy = soft_backup(q, problem.prior, beta)
     theta = 0.5 * (bounds[0] + bounds[1])
+    several = status in (Status.REDUCIBLE, Status.NO_SINGLE_RATE)
     gap = policy_gap(problem, policy, bounds, value)
     prior = check_policy("prior_policy", prior_policy, mdp.n_states, mdp.n_actions)
     there = prior > 0
@@ -55,19 +64,20 @@ def exact_solution(
     delta = float(reward_bias.max())
     with np.errstate(over="ignore", under="ignore"):
         u, psi = np.exp(beta * action_value), np.exp(log_psi)
-        rho = None if status is Status.REDUCIBLE else float(np.exp(-beta * (theta + delta)))
+        rho = None if several else float(np.exp(-beta * (theta + delta)))
     return Solution(
         policy=spread(problem, policy, prior),
         u=spread(problem, u, there.astype(np.float64)),
         psi=spread(problem, psi, np.ones(mdp.n_states)),
         rho=rho,
-        theta=None if status is Status.REDUCIBLE else theta,
+        theta=None if several else theta,
         reward_bias=spread(problem, reward_bias, np.zeros_like(prior)),
         reward_bias_max=delta,
         n_steps=n_steps,
         status=status,
         message=message,
         beta=beta,
+        optimism=problem.optimism,
         value=spread(problem, value, np.zeros(mdp.n_states)),
         action_value=spread(problem, action_value, np.where(there, 0.0, -np.inf)),
         theta_bounds=bounds,
@@ -77,8 +87,18 @@ def exact_solution(
 
 
 def bias(problem: BellmanProblem, log_psi: np.ndarray) -> np.ndarray:
-    """delta(s,a) = (log <psi> - <log psi>)/beta of equation (9), [n, A], reward."""
-    delta = np.maximum(problem.tilt(log_psi)[0] - problem.transition @ log_psi, 0.0) / problem.beta
+    """delta(s,a), [n, A], reward: (log <psi> - <log psi>)/beta of equation (9) at optimism 0.
+
+    At any optimism (1 - optimism) (C V - C' V), with C' of optimism - 1 and V = -log(psi)/beta: >= 0 up to 1, where
+    there is no bias, and <= 0 above.
+    """
+    lam, beta = problem.optimism, problem.beta
+    if lam == 0.0:
+        delta = np.maximum(problem.tilt(log_psi)[0] - problem.transition @ log_psi, 0.0) / beta
+    else:
+        # (1 - optimism) C' V = -(1/beta) log <psi^(1 - optimism)>
+        delta = (1 - lam) * problem.certainty_equivalent(-log_psi / beta) + problem.tilt((1 - lam) * log_psi)[0] / beta
+        delta = np.maximum(delta, 0.0) if lam <= 1 else np.minimum(delta, 0.0)
     return np.asarray(delta.reshape(problem.reward.shape))
 
 
@@ -92,9 +112,9 @@ def policy_gap(
     parts = (problem.transition, problem.reward, problem.prior, problem.beta, policy)
     worth = -np.inf
     if value is not None:
-        worth = float(policy_gains(*parts, value)[0].min())
+        worth = float(policy_gains(*parts, value, problem.kappa)[0].min())
     if value is None or -worth - bounds[0] > 2 * (bounds[1] - bounds[0]):
-        worth = max(worth, objective(*parts, problem.start).low)
+        worth = max(worth, objective(*parts, problem.start, optimism=problem.optimism).low)
     return max(float(np.nextafter(-bounds[0] - worth, np.inf)), 0.0)
 
 
@@ -125,6 +145,8 @@ def ended(
         status = Status.STEP_LIMIT
     elif len(problem.classes[1]) > 1:
         status, message = Status.REDUCIBLE, explain_classes(problem)
+    elif problem.optimism < 0 and bounds[1] - bounds[0] > ROUNDING_WIDTH * problem.reward_range:
+        status, message = Status.NO_SINGLE_RATE, SEVERAL_RATES
     else:
         status = Status.STAGNATED
     return exact_solution(mdp, problem, value, status, steps, bounds, prior_policy, message, k)
