@@ -28,6 +28,8 @@ _PUBLIC = {
     "experience.simulation": "Simulation",
     "experience.sources": "Source",
     "experience.transitions": "Transitions",
+    "inverse.fit": "RewardFit fit_reward",
+    "inverse.soft_bellman": "SoftBellman soft_bellman",
     "learners.certainty_equivalence": "CertaintyEquivalence",
     "learners.efficient_s1.algorithm": "EfficientS1",
     "learners.learner": "Learner NonFiniteError State StreamLearner",
