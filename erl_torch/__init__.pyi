@@ -23,6 +23,10 @@ from erl_torch.experience.rollouts import rollout as rollout
 from erl_torch.experience.simulation import Simulation as Simulation
 from erl_torch.experience.sources import Source as Source
 from erl_torch.experience.transitions import Transitions as Transitions
+from erl_torch.inverse.fit import RewardFit as RewardFit
+from erl_torch.inverse.fit import fit_reward as fit_reward
+from erl_torch.inverse.soft_bellman import SoftBellman as SoftBellman
+from erl_torch.inverse.soft_bellman import soft_bellman as soft_bellman
 from erl_torch.labels import Labels as Labels
 from erl_torch.learners.certainty_equivalence import CertaintyEquivalence as CertaintyEquivalence
 from erl_torch.learners.efficient_s1.algorithm import EfficientS1 as EfficientS1
@@ -53,6 +57,10 @@ from erl_torch.solvers import solve_biasing as solve_biasing
 from erl_torch.solvers import solve_soft_bellman as solve_soft_bellman
 from erl_torch.solvers.charge import Charge as Charge
 from erl_torch.solvers.charge import smallest_charge as smallest_charge
+from erl_torch.solvers.dial import DynamicsInMind as DynamicsInMind
+from erl_torch.solvers.dial import Slope as Slope
+from erl_torch.solvers.dial import dynamics_in_mind as dynamics_in_mind
+from erl_torch.solvers.dial import slope as slope
 from erl_torch.solvers.discounted import solve_discounted as solve_discounted
 from erl_torch.solvers.episodes import EpisodeFigures as EpisodeFigures
 from erl_torch.solvers.episodes import evaluate_episodes as evaluate_episodes

@@ -18,7 +18,7 @@ FLOORS = (
     {"envs", "solvers"},
     {"experience"},
     {"empirical", "evaluation"},
-    {"learners"},
+    {"learners", "inverse"},
     {"run"},
     {"reproduction"},
     {"cli"},

@@ -1,0 +1,389 @@
+"""Which reward explains this behaviour? ``fit_reward``, from demonstrations in a known or counted model.
+
+The expert is taken to be optimal for a reward r = sum_k w_k phi_k, as ``solve_soft_bellman`` has it: with policy pi_w
+and rate g_w. At optimism 0 the estimator balances the flow (docs/theory.md, Inverse):
+
+    pi_E(a|s) = (n(s,a) + c prior) / (n(s) + c),  d_E the long-run share of pairs under pi_E,
+    maximise    beta (sum d_E r_w - g_w) - penalty |w|^2 / 2.
+
+That is concave, and its first term is the mean of log(pi_w/prior) over d_E. Only pi_E(a|s) enters: demonstrations may
+be short, begin anywhere and be cut anywhere. Above optimism 0 the mean of log pi_w over the demonstrations is maximised
+itself; it is not concave, and what is found is a local maximum.
+
+What behaviour cannot tell: at optimism 0, w and w + v explain it alike if sum_k v_k phi_k = Phi(s) - E Phi(s') + const,
+which a table of rewards always allows: of S A entries S A - S are told. The weights returned have no part in such
+directions. Above optimism 0 the directions named are those that change nothing to first order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.optimize import minimize
+
+from erl_torch import checks
+from erl_torch.checks import InputError
+from erl_torch.empirical.counts import EmpiricalMDP
+from erl_torch.experience.experience import Experience
+from erl_torch.inverse.demonstrations import Demonstrated, Setting, demonstrated, setting
+from erl_torch.inverse.derivatives import Linearised, linearise
+from erl_torch.mdp.tabular import TabularMDP
+from erl_torch.solution import Solution
+from erl_torch.solvers.chains import SingularChainError
+from erl_torch.solvers.problem import BellmanProblem
+from erl_torch.solvers.soft_bellman import solve_problem
+
+TOLD = 1e-9  # of singular values of the advantages, relative to the largest: below, behaviour tells nothing
+WIDTH = 1e-9  # of TV - V, relative to the rewards' range, at which a value is a solution
+WARM_STEPS = 8  # Newton steps from the value of the reward before
+SCORING_STEPS = 50
+SHARED = ("pattern", "elimination", "classes")  # of problems that differ in their rewards alone
+MUCH_UNSEEN = 1e-3  # of the expert's time
+PART = 1e-6  # of a feature that may lie in directions that are not told
+SMALL = 1e-14  # eigenvalues of the information, relative to the largest, that rounding hides
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RewardFit:
+    """A reward that explains demonstrations, how sure they are of it, and what they cannot tell.
+
+    Errors are of first order, and count the chance in the expert's actions alone: the model is taken to be right.
+    """
+
+    weights: np.ndarray  # [F], reward; no part in ``unidentified``
+    reward: np.ndarray  # [S, A], sum_k w_k phi_k; of a table 0 in pairs that take no part
+    standard_error: np.ndarray | None  # of ``weights``, [F]; None where the policy was exact
+    identified: np.ndarray  # [F] bool: whether the weight itself is, not only a combination of it with others
+    unidentified: np.ndarray  # [F, k], orthonormal columns: w plus any of them explains the behaviour as well
+    eigenvalues: np.ndarray  # of the information of one step about the other directions, ascending, 1/reward^2
+    unmet: tuple[int, ...]  # features that are 0 in all that was demonstrated
+    solution: Solution  # of ``reward``, with its certificate
+    gap: float  # what pi_E loses by ``reward``: mean KL(pi_E || pi) / beta over its flow, reward per step
+    log_likelihood: float  # mean of log(pi/prior) over the demonstrations, nats per step
+    n_steps: float  # demonstrated; infinite where the policy was exact
+    converged: bool  # the flows of features differ by ``tol`` of each feature's size at most, the penalty counted
+    message: str
+    names: tuple[str, ...]
+
+    def __str__(self) -> str:
+        """A line a feature: weight, standard error, what is not told."""
+        lines = []
+        width = max(map(len, self.names))
+        for k, name in enumerate(self.names):
+            error = "" if self.standard_error is None else f" +- {self.standard_error[k]:.2g}"
+            more = "" if self.identified[k] else "  (not told apart from others)"
+            lines.append(f"{name:{width}} {self.weights[k]: .4g}{error}{more}{'  (never met)' * (k in self.unmet)}")
+        return "\n".join([*lines, *([self.message] if self.message else [])])
+
+
+def fit_reward(
+    demonstrations: Experience | ArrayLike,
+    features: ArrayLike | None = None,
+    *,
+    mdp: TabularMDP | EmpiricalMDP,
+    beta: float,
+    prior_policy: ArrayLike | None = None,
+    penalty: float = 0.0,
+    pseudo_count: float = 0.01,
+    exact: bool = False,
+    names: Sequence[str] | None = None,
+    tol: float = 1e-9,
+    max_iterations: int = 1000,
+    optimism: float = 0.0,
+) -> RewardFit:
+    """The reward, as a sum of features, for which the demonstrated behaviour is optimal; optimism 1 optimistic (control
+    as inference), 0 right, negative is refused.
+
+    Args:
+        demonstrations: tuples, of which s and a count (their order, rewards and a' do not); or a table [S, A] of counts
+            n(s, a), or with ``exact`` of a policy, or of shares of pairs: proportions within a row are the policy.
+        features: [S, A, F], or [S, F] of the state alone; None: each pair is one, the reward is a table.
+        mdp: the model, whose rewards are ignored; or counts of tuples, the expert's or others', as of
+            ``empirical_mdp``.
+        beta: inverse temperature of the expert, 1/reward. Only beta times the reward is told.
+        prior_policy: [S, A], 0 where an action is not to be taken; None is uniform over the actions of each state.
+        penalty: >= 0, 1/reward^2, of |w|^2 / 2, taken from the log-likelihood of one step.
+        pseudo_count: > 0, steps of the prior that are added to those of each state.
+        exact: the table is the expert's policy itself, of infinitely many steps.
+        names: [F], of the features; None: numbers, or pairs.
+        tol: of the gradient: difference of mean features, each in units of its largest value.
+        max_iterations: of L-BFGS.
+        optimism: of the expert, >= 0.
+
+    Returns:
+        A RewardFit.
+
+    Raises:
+        InputError: arguments out of range, optimism below 0, no step in a pair of the problem, or a model that
+            ``solve_soft_bellman`` does not solve.
+    """
+    beta = checks.temperature("beta", beta)
+    if checks.optimism("optimism", optimism, beta) < 0:
+        raise InputError("optimism", optimism, ">= 0: below 0 not even the rate is a convex function of the reward")
+    penalty = checks.number("penalty", penalty, lambda x: 0 <= x < np.inf, "a finite number >= 0")
+    checks.positive("pseudo_count", pseudo_count)
+    checks.positive("tol", tol)
+    checks.at_least("max_iterations", max_iterations, 1)
+    given = setting(mdp, beta, prior_policy, optimism)
+    expert = demonstrated(demonstrations, given, pseudo_count, checks.flag("exact", exact))
+    table, labels = _features(features, given, names)
+    objective = _Objective(given, expert, table, penalty)
+    weights, at, converged = _maximise(objective, tol, max_iterations)
+    told, hidden = _directions(objective, at)
+    if optimism == 0:  # shaping, which changes nothing at all
+        weights = told @ (told.T @ weights)
+    solution = objective.solve(objective.problem(weights))
+    eigenvalues, error = _information(objective, at, told)
+    seen = (expert.weight if expert.exact else expert.counts).ravel() > 0
+    unmet = tuple(np.flatnonzero(~(table[seen] != 0).any(0)).tolist())
+    return RewardFit(
+        weights=weights,
+        reward=_reward(features, given, table, weights),
+        standard_error=error,
+        identified=np.sqrt((hidden**2).sum(1)) < PART,
+        unidentified=hidden,
+        eigenvalues=eigenvalues,
+        unmet=unmet,
+        solution=solution,
+        gap=float(_divergence(expert.policy, at) @ expert.flow.sum(1)) / beta,
+        log_likelihood=float((expert.weight * at.log_ratio).sum()),
+        n_steps=np.inf if expert.exact else expert.n_steps,
+        converged=converged,
+        message=_message(given, expert, hidden, [labels[k] for k in unmet], converged, solution),
+        names=labels,
+    )
+
+
+def _features(
+    features: ArrayLike | None, given: Setting, names: Sequence[str] | None
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """(features of the problem's pairs [n*A, F], 0 where the prior is 0; their names)."""
+    problem, there = given.problem, given.problem.prior > 0
+    n_states, n_actions = given.prior.shape
+    if features is None:
+        pairs = np.argwhere(there)
+        checks.room("features", (there.size, len(pairs)))
+        table = np.zeros((there.size, len(pairs)))
+        table[np.flatnonzero(there), np.arange(len(pairs))] = 1.0
+        labels = tuple(f"({problem.states[s]}, {a})" for s, a in pairs)
+    else:
+        whole = _every_pair(features, n_states, n_actions)
+        table = np.where(there[:, :, None], whole[problem.states], 0.0).reshape(there.size, -1)
+        labels = tuple(map(str, range(table.shape[1])))
+    if names is not None:
+        labels = checks.sequence("names", names)
+        for name in labels:
+            checks.instance("names", name, str, "texts")
+        if len(labels) != table.shape[1]:
+            raise InputError("names", f"{len(labels)} names", f"{table.shape[1]}, one a feature")
+    return table, labels
+
+
+def _every_pair(features: ArrayLike, n_states: int, n_actions: int) -> np.ndarray:
+    """``features`` as [S, A, F]."""
+    table = checks.real("features", features)
+    if table.ndim == 2:
+        by_state = checks.array("features", table, (n_states, "n_features"))
+        return np.repeat(by_state[:, None, :], n_actions, axis=1)
+    return checks.array("features", table, (n_states, n_actions, "n_features"))
+
+
+def _reward(features: ArrayLike | None, given: Setting, table: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """[S, A]."""
+    if features is not None:
+        return np.asarray(_every_pair(features, *given.prior.shape) @ weights)
+    reward = np.zeros(given.prior.shape)
+    reward[given.problem.states] = (table @ weights).reshape(given.problem.reward.shape)
+    return reward
+
+
+class _Objective:
+    """The log-likelihood of one step less the penalty, with its derivatives, as a function of x [F]: weights times beta
+    times ``scale``, the size of each feature."""
+
+    def __init__(self, given: Setting, expert: Demonstrated, features: np.ndarray, penalty: float) -> None:
+        self.given, self.base, self.expert, self.penalty = given, given.problem, expert, penalty
+        self.scale = np.abs(features).max(0)
+        self.scale[self.scale == 0] = 1.0
+        self.features = features / self.scale
+        self.stiffness = penalty / (self.base.beta * self.scale) ** 2
+        self._aim = self.features.T @ expert.flow.ravel()
+        self._value: np.ndarray | None = None
+
+    def weights(self, x: np.ndarray) -> np.ndarray:
+        return np.asarray(x / (self.base.beta * self.scale))
+
+    def problem(self, weights: np.ndarray) -> BellmanProblem:
+        """With the reward of ``weights`` [F]."""
+        base = self.base
+        reward = (self.features @ (self.scale * weights)).reshape(base.reward.shape)
+        problem = replace(base, reward=base.reward + reward)
+        for name in SHARED:
+            problem.__dict__[name] = getattr(base, name)
+        return problem
+
+    def solve(self, problem: BellmanProblem) -> Solution:
+        return solve_problem(problem, self.given.mdp, self.given.prior)
+
+    def at(self, x: np.ndarray) -> Linearised | None:
+        """The solution; None where there is none in double precision."""
+        problem = self.problem(self.weights(x))
+        if not np.isfinite(problem.reward).all():
+            return None
+        for value in (self._value, None):
+            try:
+                if value is None:
+                    whole = self.solve(problem).value
+                    assert whole is not None
+                    value = whole.numpy()[problem.states]
+                found = linearise(problem, value, WARM_STEPS)
+            except SingularChainError:
+                continue
+            if found.width <= WIDTH * problem.reward_range:
+                self._value = found.value
+                return found
+        return None
+
+    def share(self, at: Linearised) -> np.ndarray:
+        """Weight of each state in the second derivative, [n]."""
+        return at.share if self.base.kappa == 0 else np.asarray(self.expert.weight.sum(1))
+
+    def evaluate(self, x: np.ndarray, at: Linearised) -> tuple[float, np.ndarray]:
+        """(objective, its gradient [F])."""
+        beta, expert = self.base.beta, self.expert
+        mean = float((expert.weight * at.log_ratio).sum())
+        if self.base.kappa == 0:
+            reward = float((expert.flow * at.problem.reward).sum())
+            mean = beta * (reward - at.rate)
+            gradient = self._aim - self.features.T @ (at.share[:, None] * at.policy).ravel()
+        else:
+            none = np.zeros(len(at.value))
+            gradient = self.features.T @ at.backward(none, 0.0, expert.weight).pair.ravel() / beta
+        return mean - float(self.stiffness @ x**2) / 2, gradient - self.stiffness * x
+
+
+def _maximise(objective: _Objective, tol: float, max_iterations: int) -> tuple[np.ndarray, Linearised, bool]:
+    """(weights [F], the solution there, whether the gradient is small): L-BFGS, then scoring steps."""
+    n_features = objective.features.shape[1]
+
+    def loss(x: np.ndarray) -> tuple[float, np.ndarray]:
+        at = objective.at(x)
+        if at is None:
+            return np.inf, np.zeros(n_features)
+        value, gradient = objective.evaluate(x, at)
+        return -value, -gradient
+
+    x, at = np.zeros(n_features), objective.at(np.zeros(n_features))
+    if at is None:
+        why = objective.solve(objective.problem(x))
+        allowed = f"a model that solve_soft_bellman solves ({why.message or why.status.value})"
+        raise InputError("mdp", f"a model whose solution is {why.status.name}", allowed)
+    options = {"maxiter": max_iterations, "maxfun": 4 * max_iterations, "ftol": 1e-13, "gtol": tol, "maxcor": 20}
+    x = minimize(loss, x, jac=True, method="L-BFGS-B", options=options).x
+    at = objective.at(x)
+    assert at is not None
+    value, gradient = objective.evaluate(x, at)
+    for _ in range(SCORING_STEPS):
+        if np.abs(gradient).max() <= 1e-3 * tol:
+            break
+        better = _scored(objective, x, at, value, gradient)
+        if better is None:
+            break
+        x, at, value, gradient = better
+    return objective.weights(x), at, bool(np.abs(gradient).max() <= tol)
+
+
+def _scored(
+    objective: _Objective, x: np.ndarray, at: Linearised, value: float, gradient: np.ndarray
+) -> tuple[np.ndarray, Linearised, float, np.ndarray] | None:
+    """(x, solution, objective, gradient) after a step along the inverse information; None where no part of it helps."""
+    information = _squares(at, _advantages(objective, at), objective.share(at)) + np.diag(objective.stiffness)
+    sizes, axes = np.linalg.eigh(information)
+    kept = sizes > SMALL * max(sizes[-1], 0.0)
+    step = axes[:, kept] @ ((axes[:, kept].T @ gradient) / sizes[kept])
+    for length in 0.5 ** np.arange(10):
+        new = x + length * step
+        there = objective.at(new)
+        if there is None:
+            continue
+        new_value, new_gradient = objective.evaluate(new, there)
+        smaller = np.linalg.norm(new_gradient) < 0.9 * np.linalg.norm(gradient)
+        if new_value > value + 1e-14 * max(abs(value), 1.0) or (smaller and new_value > value - 1e-12):
+            return new, there, new_value, new_gradient
+    return None
+
+
+def _advantages(objective: _Objective, at: Linearised) -> np.ndarray:
+    """Those of the features, divided by their sizes, [n*A, F]."""
+    n, n_actions = at.policy.shape
+    return at.advantages(objective.features.reshape(n, n_actions, -1)).reshape(n * n_actions, -1)
+
+
+def _squares(at: Linearised, advantages: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """sum_s share sum_a pi A A', [F, F]."""
+    weight = (share[:, None] * at.policy).ravel()
+    return np.asarray(advantages.T @ (weight[:, None] * advantages))
+
+
+def _directions(objective: _Objective, at: Linearised) -> tuple[np.ndarray, np.ndarray]:
+    """Orthonormal columns of the directions of the weights [F] that behaviour tells, and of those that it does not."""
+    scaled = _advantages(objective, at)[objective.base.prior.ravel() > 0]
+    n_pairs, n_features = scaled.shape
+    _, sizes, axes = np.linalg.svd(scaled, full_matrices=n_features > n_pairs)
+    rank = int((sizes > max(TOLD * sizes[0], 1e-300)).sum())
+    whole = np.linalg.qr((axes[rank:] / objective.scale).T, mode="complete")[0]
+    return whole[:, n_features - rank :], whole[:, : n_features - rank]
+
+
+def _information(objective: _Objective, at: Linearised, told: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    """(eigenvalues of a step's information about the directions ``told``, standard errors of the weights [F]).
+
+    With h the weight of a state in the objective, its second derivative is -H, H = beta^2 sum_s h E A A', and the
+    variance of its first that of the expert's actions, beta^2 sum_s h^2 E A A' / n(s): the errors are those of
+    H^-1 (...) H^-1, which is the inverse of the Fisher information where steps fall as h does.
+    """
+    expert, beta = objective.expert, objective.base.beta
+    share = objective.share(at)
+    advantages = beta * (_advantages(objective, at) * objective.scale) @ told
+    sizes, axes = np.linalg.eigh(_squares(at, advantages, share))
+    if expert.exact:
+        return sizes, None
+    visits = expert.counts.sum(1)
+    reach = share**2 * visits / (visits + expert.pseudo_count) ** 2
+    known = sizes > SMALL * sizes[-1] if len(sizes) else np.zeros(0, bool)
+    inverse = 1.0 / np.where(known, sizes + objective.penalty, np.inf)
+    spread = told @ (axes * inverse)
+    variance = np.einsum("fi,ij,fj->f", spread, axes.T @ _squares(at, advantages, reach) @ axes, spread)
+    error = np.sqrt(np.maximum(variance, 0.0))
+    lost = np.sqrt(((told @ axes[:, ~known]) ** 2).sum(1)) > PART
+    return sizes, np.where(lost, np.inf, error)
+
+
+def _divergence(policy: np.ndarray, at: Linearised) -> np.ndarray:
+    """KL(policy || pi*) of each state, [n]."""
+    prior = at.problem.prior
+    ratio = policy / np.where(prior > 0, prior, 1.0)
+    terms = np.where(policy > 0, policy * (np.log(np.where(policy > 0, ratio, 1.0)) - at.log_ratio), 0.0)
+    return np.asarray(np.maximum(terms.sum(1), 0.0))
+
+
+def _message(
+    given: Setting, expert: Demonstrated, hidden: np.ndarray, unmet: list[str], converged: bool, solution: Solution
+) -> str:
+    """What to know of the fit, in one line; "" where there is nothing."""
+    parts = [given.message] if given.message else []
+    if not converged:
+        parts.append("the maximum was not reached: weights may grow without end (a penalty keeps them)")
+    if hidden.shape[1]:
+        parts.append(f"{hidden.shape[1]} of {len(hidden)} directions of the weights change no behaviour")
+    if unmet:
+        more = "..." if len(unmet) > 5 else ""
+        parts.append(f"no demonstration meets {', '.join(unmet[:5])}{more}: told by what was avoided alone")
+    if expert.unseen > MUCH_UNSEEN:
+        parts.append(f"{expert.unseen:.2g} of the expert's time would pass in states without a step, on the prior")
+    if solution.status.name != "CONVERGED":
+        parts.append(f"the solution is {solution.status.name}: {solution.message or solution.status.value}")
+    return "; ".join(parts)
