@@ -46,6 +46,7 @@ _PUBLIC = {
     "solution": "Solution Status",
     "solvers": "certify iterate_biasing perron solve_biasing solve_soft_bellman",
     "solvers.charge": "Charge smallest_charge",
+    "solvers.dial": "DynamicsInMind Slope dynamics_in_mind slope",
     "solvers.discounted": "solve_discounted",
     "solvers.episodes": "EpisodeFigures evaluate_episodes",
     "solvers.finite_horizon": "solve_finite_horizon",

@@ -57,6 +57,10 @@ from erl_torch.solvers import solve_biasing as solve_biasing
 from erl_torch.solvers import solve_soft_bellman as solve_soft_bellman
 from erl_torch.solvers.charge import Charge as Charge
 from erl_torch.solvers.charge import smallest_charge as smallest_charge
+from erl_torch.solvers.dial import DynamicsInMind as DynamicsInMind
+from erl_torch.solvers.dial import Slope as Slope
+from erl_torch.solvers.dial import dynamics_in_mind as dynamics_in_mind
+from erl_torch.solvers.dial import slope as slope
 from erl_torch.solvers.discounted import solve_discounted as solve_discounted
 from erl_torch.solvers.episodes import EpisodeFigures as EpisodeFigures
 from erl_torch.solvers.episodes import evaluate_episodes as evaluate_episodes

@@ -34,6 +34,7 @@ class Evaluation(NamedTuple):
     reward_per_step: float  # exact over the horizon where the model is known, else sampled
     objective: float  # stationary reward rate - KL/beta, as ``objective``, where the model is known; else sampled
     success_rate: float = np.nan  # of episodes within the horizon; NaN where it is not known what a success is
+    objective_real: float = np.nan  # the objective at optimism 0, in the real world, where that of the run is another
 
 
 def evaluate(

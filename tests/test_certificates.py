@@ -19,7 +19,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
 import adversarial
 
-EACH = 12  # problems of a kind
+EACH = 8  # problems of a kind
 
 
 @pytest.fixture(autouse=True)

@@ -98,7 +98,7 @@ def steps_follow_the_model(env):
     n_states, n_actions = env.mdp.n_states, env.mdp.n_actions
     counts = np.zeros((n_states * n_actions, n_states))
     state, _ = env.reset(seed=0)
-    draws = np.random.default_rng(1).random(60_000)
+    draws = np.random.default_rng(1).random(30_000)
     have = [np.flatnonzero(row) for row in env.mdp.allowed]
     for draw in draws:
         action = int(have[state][int(draw * len(have[state]))])

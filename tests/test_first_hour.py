@@ -220,7 +220,7 @@ def test_other_values_stay(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["beta=2", "josé", "run#3", "a(1)", "x[0]", "o'hara", "a,b", 'q"q', "back\\slash"])
+@pytest.mark.parametrize("name", ["beta=2", "josé #3", "a(1)[0]", "o'hara,b", 'q"q\\b'])
 def test_models_of_any_name(tmp_path, typed_here, name):
     TabularMDP(np.full((2, 2, 2), 0.5), np.eye(2)).save(tmp_path / f"{name}.npz")
     model = ("env=mdp", f"env.path={name}.npz", "learner=exact", "evaluation.pictures=false")

@@ -7,9 +7,10 @@ import os
 import sys
 
 import pytest
-from helpers import ROOT, ended, events
+from helpers import ROOT, composed, ended, events
 
 from erl_torch.output import Lasting
+from erl_torch.run.training import train as perform
 
 SMALL = ("experience.n_episodes=2", "learner.n_epochs=2", "learner.n_bias=2", "evaluation.pictures=false")
 
@@ -67,6 +68,7 @@ def test_lost_output_is_sent_nowhere_and_named_once(monkeypatch, capfd):
 
 def test_runs_end_well_without_their_output(tmp_path, start):
     """On a full device, with a reader that is gone, with closed descriptors, and a sweep."""
+    perform(composed(*SMALL), tmp_path / "here")  # compiles the loops, once for all processes
     train = [sys.executable, str(ROOT / "train.py"), *SMALL]
     end, broken = os.pipe()
     os.close(end)

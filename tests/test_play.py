@@ -239,11 +239,13 @@ def test_solutions_with_a_wrong_field_are_refused(cliff, tmp_path, field):
 
 
 def test_command_line(cliff, tmp_path, start):
-    for overrides, code, out, err in [
+    cases = [
         ((f"run={cliff}", "render=none", "n_episodes=2"), 0, "windy_cliff, exact, seed 0", ""),
         (("run=nowhere",), 1, "", "error: run=nowhere: must be a run directory"),
-    ]:
-        found = ended(start(sys.executable, ROOT / "play.py", *overrides, cwd=tmp_path))
+    ]
+    played = [start(sys.executable, ROOT / "play.py", *overrides, cwd=tmp_path) for overrides, *_ in cases]
+    for process, (_, code, out, err) in zip(played, cases, strict=True):
+        found = ended(process)
         assert found[0] == code, found
         assert found[1].startswith(out)
         assert found[2].startswith(err)

@@ -89,7 +89,9 @@ def test_the_cut_is_moved_off_a_state_that_is_hardly_ever_met(n, back):
     log_y = np.random.default_rng(n).standard_normal(n)
     mdp = TabularMDP(p[:, None] / p.sum(1)[:, None, None], np.zeros((n, 1)), np.eye(n)[0])
     log_weight = log_y - np.log(dense(mdp)[:, 0] @ np.exp(log_y))
-    found = NewtonPattern.of(BellmanProblem.of(mdp, 1.0)).eigenvector(log_weight[:, None], 0, 1e-13, 60)
+    found = NewtonPattern.of(BellmanProblem.of(mdp, 1.0)).eigenvector(
+        log_weight[:, None], np.log(mdp.transition.data), 0, 1e-13, 60
+    )
     assert found is not None
     h, (low, high), _ = found
     np.testing.assert_allclose(h - h[0], log_y - log_y[0], atol=1e-11)

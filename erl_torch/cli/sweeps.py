@@ -40,7 +40,8 @@ from erl_torch.run.origin import key_of
 EXTRAS = {"joblib": "joblib", "submitit_slurm": "slurm", "submitit_local": "slurm", "optuna": "optuna"}
 FIGURES = ("objective", "theta", "gap")  # of result.json, the first to compare jobs of one problem by
 COLUMNS = (*FIGURES, "seconds")
-OF_THE_PROBLEM = ("learner.beta", "learner.prior_policy", "experience.path")  # and all of env: settings that change it
+# And all of env: settings that change it.
+OF_THE_PROBLEM = ("learner.beta", "learner.optimism", "learner.prior_policy", "experience.path")
 MOST_ROWS = 40  # of jobs that are printed beside their means over seeds; sweep.json has all
 LONG_NUMBER = r"(?<==)-?\d*\.\d{5,}(e-?\d+)?$"
 UNFINISHED = ("waiting", "running")

@@ -12,11 +12,17 @@ What no tuple shows is no part of the problem. ``EmpiricalMDP.problem`` poses th
               where it has one, states from which that is reached take part too.
 
 States that take no part keep the prior policy. ``message`` names what was left out.
+
+Rewards that vary for the same (s,a) count by their mean. Where optimism is not 0 they may count together with s' in
+place of that (``joint``), the certainty equivalent being (1/kappa) log <exp(kappa (r + V(s')))> over the tuples of the
+pair, kappa = optimism * beta: S1's listing at optimism 1. That is the problem of other frequencies and rewards,
+
+    p'(s'|s,a) ~ n(s,a,s') <exp(kappa r)>(s,a,s'),    r'(s,a) = (1/kappa) log <exp(kappa r)>(s,a).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse as sp
@@ -30,6 +36,7 @@ from erl_torch.mdp.tabular import check_prior, normalise_rows
 from erl_torch.solvers.chains import classes
 from erl_torch.solvers.problem import BellmanProblem
 
+NOISE = ("mean", "joint")  # how rewards that vary count
 BLOCK = 1 << 16  # tuples at a time: they stay in the processor's cache
 
 
@@ -51,13 +58,16 @@ class EmpiricalMDP:
     def n_actions(self) -> int:
         return int(self.visits.shape[1])
 
-    def problem(self, beta: float, prior_policy: ArrayLike | None = None) -> EmpiricalProblem:
+    def problem(self, beta: float, prior_policy: ArrayLike | None = None, *, optimism: float = 0.0) -> EmpiricalProblem:
         """The empirical problem; the module's docstring says what is left out.
 
+        ``optimism``: 1 optimistic (control as inference), 0 right, negative robust.
+
         Raises:
-            InputError: beta or prior out of range, or no state that is ever returned to.
+            InputError: beta, prior or optimism out of range, or no state that is ever returned to.
         """
         beta = checks.temperature("beta", beta)
+        optimism = checks.optimism("optimism", optimism, beta)
         prior = check_prior("prior_policy", prior_policy, self.n_states, self.n_actions)
         used, entries, message, reducible = self._solvable(prior > 0)
         taken = used.any(1)
@@ -76,7 +86,7 @@ class EmpiricalMDP:
         reward = np.take_along_axis(self.reward[states], action, axis=1) + np.log(np.minimum(mass, 1.0)) / beta
         visits = (self.visits * (prior > 0))[states]
         start = visits.sum(1) / visits.sum()
-        problem = BellmanProblem(states, p, reward, weight / mass, start, float(beta))
+        problem = BellmanProblem(states, p, reward, weight / mass, start, float(beta), optimism)
         return EmpiricalProblem(problem, used, message, reducible, np.minimum(mass[:, 0], 1.0))
 
     def _solvable(self, allowed: np.ndarray) -> tuple[np.ndarray, np.ndarray, str, bool]:
@@ -247,3 +257,39 @@ def empirical_mdp(data: Experience, n_states: int, n_actions: int, counted: Tall
         reward_variance=(squares / np.maximum(visits - 1, 1)).reshape(n_states, n_actions),
         reward_given_next=counted.reward_given_next,
     )
+
+
+def joint(model: EmpiricalMDP, data: Experience, kappa: float) -> EmpiricalMDP:
+    """``model``, of the stream ``data``, with rewards that count together with s': the module's docstring.
+
+    Two passes over the stream; pairs whose rewards do not vary stay as they are, and all do at kappa 0. Intervals
+    (``erl_torch.empirical.uncertainty``) are of mean rewards alone.
+
+    Args:
+        model: ``empirical_mdp`` of ``data``.
+        data: the tuples.
+        kappa: optimism * beta, 1/reward.
+    """
+    varied = np.asarray(model.reward_variance.ravel() > 0)
+    if kappa == 0 or not varied.any():
+        return model
+    p, n_states, n_actions = model.transition, np.int64(model.n_states), np.int32(model.n_actions)
+    row = np.repeat(np.arange(p.shape[0]), np.diff(p.indptr))
+    keys = row * n_states + p.indices
+    largest, total = np.full(p.nnz, -np.inf), np.zeros(p.nnz)
+    for sums in (False, True):
+        for chunk in data.chunks():
+            entry = np.searchsorted(keys, (chunk.s * n_actions + chunk.a) * n_states + chunk.s_next)
+            if sums:
+                np.add.at(total, entry, np.exp(kappa * chunk.r - largest[entry]))
+            else:
+                np.maximum.at(largest, entry, kappa * chunk.r)
+    first = p.indptr[:-1][np.diff(p.indptr) > 0]
+    log_share = largest + np.log(total / model.visits.ravel()[row])
+    log_mean = np.zeros(p.shape[0])
+    log_mean[row[first]] = np.logaddexp.reduceat(log_share, first)
+    # A share that underflows stays a successor.
+    share = np.where(varied[row], np.maximum(np.exp(log_share - log_mean[row]), 1e-300), p.data)
+    reward = np.where(varied, log_mean / kappa, model.reward.ravel())
+    transition = sp.csr_array((share, p.indices, p.indptr), shape=p.shape)
+    return replace(model, transition=transition, reward=reward.reshape(model.reward.shape))

@@ -69,8 +69,18 @@ class StreamNeeds(Protocol):
     def beta(self) -> float: ...
 
     @property
+    def optimism(self) -> float: ...
+
+    @property
+    def reward_noise(self) -> str: ...
+
+    @property
     def averages_exp_reward(self) -> bool:
         """Whether noise in r counts as reward."""
+
+    @property
+    def assumed_optimism(self) -> float | None:
+        """Of a learner that has no choice in it, where that is not 0."""
 
     @property
     def drawn_from_prior(self) -> str:
@@ -116,6 +126,14 @@ def of_stream(counted: Counted, learner: StreamNeeds, prior: np.ndarray) -> list
     reservations = of_rewards(*counted.tally.reward_range)
     if learner.averages_exp_reward:
         reservations += of_noise(counted, learner.beta)
+    if learner.assumed_optimism is not None:
+        reservations += of_optimism(counted, learner.assumed_optimism)
+    if learner.reward_noise == "joint" and learner.optimism and counted.tally.varied:
+        text = (
+            "rewards vary for the same (s,a), and count together with s' (learner.reward_noise=joint): objectives, and "
+            "what is proven where a model is known, are of mean rewards"
+        )
+        reservations.append(Reservation("rewards count together with s'", text))
     if learner.drawn_from_prior == "a":
         reservations += of_actions(counted.tally.visits.reshape(prior.shape), prior, "a")
     elif learner.drawn_from_prior == "a_next":
@@ -155,6 +173,25 @@ def of_noise(counted: Counted, beta: float) -> list[Reservation]:
             "learner=certainty_equivalence takes mean rewards",
         )
     ]
+
+
+def of_optimism(counted: Counted, optimism: float) -> list[Reservation]:
+    """What a learner at an optimism of its own makes of dynamics that are left to chance."""
+    seen = counted.tally
+    if not (np.diff(seen.indptr) > 1).any():
+        return []
+    text = (
+        f"the dynamics are left to chance, and this learner is optimistic about them: it solves optimism {optimism:g} "
+        f"of the dial (as learner=s1 learner.optimism={optimism:g} does), and is held against optimism 0"
+    )
+    return [Reservation("optimistic about the dynamics", text)]
+
+
+def of_estimate(estimate: Estimate | None) -> list[Reservation]:
+    """That what the data say rests on a handful of tuples."""
+    if estimate is None or not estimate.warning:
+        return []
+    return [Reservation("a handful of tuples", f"what the data say of theta: {estimate.warning}")]
 
 
 def divergence(counts: np.ndarray, row: np.ndarray, p: np.ndarray, n_rows: int) -> tuple[float, int]:

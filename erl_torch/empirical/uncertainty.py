@@ -35,6 +35,12 @@ interval, where there is none.
 
 A state that the data never show is no part of the problem (``erl_torch.empirical.counts``), nor of the error.
 
+Above optimism 0 and below, kappa = optimism * beta, J is the nested one (``erl_torch.solvers``), E V gives way to
+C V = (1/kappa) log E exp(kappa V(s')), d is of the process of pi and q = p exp(kappa (V(s') - C V)), and in place of
+V(s') stands xi = exp(kappa (V(s') - C V)) / kappa: Var_p(xi) = chi^2(q || p) / kappa^2. ``warning`` names a pair that
+matters where max q/p is above sqrt(n): what the data say of it rests on a handful of tuples. A successor that was never
+seen shows at no optimism.
+
 The bootstrap draws n(s,a) successors anew for every pair (multinomial; the reward's mean with the noise left at a given
 successor), and solves each model. It includes the second order, and subtracts nothing.
 """
@@ -59,7 +65,7 @@ from erl_torch.empirical.counts import EmpiricalMDP, EmpiricalProblem
 from erl_torch.mdp.tabular import check_policy
 from erl_torch.solution import Status
 from erl_torch.solvers.certificates import soft_backup
-from erl_torch.solvers.chains import SingularChainError
+from erl_torch.solvers.chains import RegenerativeLU, SingularChainError
 from erl_torch.solvers.policy import kl_per_state
 from erl_torch.solvers.problem import BellmanProblem
 from erl_torch.solvers.soft_bellman import solve_problem
@@ -76,6 +82,9 @@ PATIENCE = 10  # steps that gain nothing, where J has kinks
 LARGEST_LOG_PRICE = 100.0  # logarithm of a price at which likelihood costs nothing
 END_TOLERANCE = 0.01  # of the half width: steps stop where one moves the end by less (at kinks, a few hundredths)
 TIED = 2.0  # standard errors between two actions' values, up to which either may be the better
+SMALLEST_SHARE = 1e-3  # of a Newton step
+STALLED = 0.5  # a step that leaves more of the width is the last
+UNSOLVED = 1e-6  # width, of the range of the rewards, of a relative value that is none
 COMMON = 0.5  # share of the states; a successor met from more of them may be met from any
 
 
@@ -95,6 +104,7 @@ class Estimate:
     untried: tuple[float, float] = (0.0, 0.0)  # by how much pairs never visited may lower and raise the figure
     smallest_visits: int | None = None  # of the pairs behind at least 1% of the variance
     withheld: str = ""  # why there is no interval, if there is none
+    warning: str = ""  # of a pair whose figures rest on a handful of tuples
     limits: Callable[[float], tuple[float, float]] | None = None  # fall of the log-likelihood -> interval; plug-in
 
     def interval(self, level: float = 0.95) -> tuple[float, float]:
@@ -155,23 +165,29 @@ def _check_model(model: object) -> None:
     checks.instance("model", model, EmpiricalMDP, "an EmpiricalMDP, as of empirical_mdp")
 
 
-def theta_uncertainty(model: EmpiricalMDP, beta: float, prior_policy: ArrayLike | None = None) -> Estimate:
+def theta_uncertainty(
+    model: EmpiricalMDP, beta: float, prior_policy: ArrayLike | None = None, *, optimism: float = 0.0
+) -> Estimate:
     """Plug-in estimate of theta* from counts, less its bias of second order, and its error (docs/theory.md, 4).
 
     Args:
         model: counts and mean rewards, of ``empirical_mdp``.
         beta: inverse temperature, 1/reward, > 0.
         prior_policy: [S, A], 0 where an action is not to be taken; None is uniform.
+        optimism: 1 optimistic (control as inference), 0 right, negative robust.
 
     Raises:
-        InputError: beta or prior out of range, or a stream that never returns to any state.
+        InputError: beta, prior or optimism out of range, or a stream that never returns to any state.
     """
     _check_model(model)
-    empirical = model.problem(beta, prior_policy)
+    empirical = model.problem(beta, prior_policy, optimism=optimism)
     solution = solve_problem(empirical.problem, model, prior_policy)
-    policy = solution.policy.numpy()
+    if solution.status is Status.NO_SINGLE_RATE:
+        return Estimate("theta", np.nan, np.inf, withheld="no single rate was found for all states in the data")
+    states, value = empirical.problem.states, solution.value
+    assert value is not None
     try:
-        estimate = _plug_in(model, empirical, policy[empirical.problem.states], optimal=True)
+        estimate = _plug_in(model, empirical, solution.policy.numpy()[states], True, value.numpy()[states])
     except SingularChainError:  # the optimum stays in states that the process leaves at last, or sets all but closed
         return Estimate("theta", np.nan, np.inf, withheld=FALLS_APART)
     limits = estimate.limits
@@ -186,28 +202,34 @@ def theta_uncertainty(model: EmpiricalMDP, beta: float, prior_policy: ArrayLike 
 
 
 def policy_uncertainty(
-    model: EmpiricalMDP, policy: ArrayLike, beta: float, prior_policy: ArrayLike | None = None
+    model: EmpiricalMDP,
+    policy: ArrayLike,
+    beta: float,
+    prior_policy: ArrayLike | None = None,
+    *,
+    optimism: float = 0.0,
 ) -> Estimate:
-    """J(policy), the reward rate less KL/beta, from counts, less its bias of second order, and its error.
+    """J(policy), the reward rate less KL/beta at optimism 0, from counts, less its bias of second order, and its error.
 
     Args:
         model: counts and mean rewards, of ``empirical_mdp``.
         policy: [S, A], rows sum to 1.
         beta: inverse temperature, 1/reward, > 0.
         prior_policy: [S, A], 0 where an action is not to be taken; None is uniform.
+        optimism: 1 optimistic (control as inference), 0 right, negative robust; the nested J.
 
     Raises:
         InputError: a policy [S, A] that takes an action never tried (in a state of the empirical problem).
     """
     _check_model(model)
-    empirical = model.problem(beta, prior_policy)
+    empirical = model.problem(beta, prior_policy, optimism=optimism)
     table = check_policy("policy", policy, model.n_states, model.n_actions)
     untried = (table > 0) & ~empirical.used & empirical.used.any(1, keepdims=True)
     if untried.any():
         s, a = np.argwhere(untried)[0]
         raise InputError(f"policy[{s}, {a}]", table[s, a], "0, as the pair is not in the data")
     try:
-        return _plug_in(model, empirical, table[empirical.problem.states], optimal=False)
+        return _plug_in(model, empirical, table[empirical.problem.states], False)
     except SingularChainError:  # each set of states has a J of its own
         return Estimate("J", np.nan, np.inf, withheld=FALLS_APART)
 
@@ -218,6 +240,8 @@ def bootstrap_theta(
     prior_policy: ArrayLike | None = None,
     n_resamples: int = 200,
     seed: int | np.random.Generator = 0,
+    *,
+    optimism: float = 0.0,
 ) -> Estimate:
     """Estimate theta*, with the bootstrap's standard error and samples; the same seed gives the same samples.
 
@@ -229,6 +253,7 @@ def bootstrap_theta(
         prior_policy: [S, A], 0 where an action is not to be taken; None is uniform.
         n_resamples: whole number >= 2; each takes the solution of one model.
         seed: a whole number, or a generator.
+        optimism: 1 optimistic (control as inference), 0 right, negative robust.
 
     Raises:
         InputError: an argument out of range, or fewer than two samples that can be solved.
@@ -237,7 +262,7 @@ def bootstrap_theta(
     seed = checks.seed("seed", seed)
     checks.at_least("n_resamples", n_resamples, 2)
     rng = np.random.default_rng(seed)
-    plug_in = theta_uncertainty(model, beta, prior_policy)
+    plug_in = theta_uncertainty(model, beta, prior_policy, optimism=optimism)
     p, visits = model.transition, model.visits.ravel()
     rows = np.repeat(np.arange(len(visits)), np.diff(p.indptr))
     within = _within(model, p.data, rows)
@@ -251,7 +276,7 @@ def bootstrap_theta(
         drawn.eliminate_zeros()
         resampled = replace(model, transition=drawn, reward=mean.reshape(model.reward.shape))
         try:
-            problem = resampled.problem(beta, prior_policy)
+            problem = resampled.problem(beta, prior_policy, optimism=optimism)
         except InputError:
             continue
         solution = solve_problem(problem.problem, model, prior_policy, tol=1e-8)
@@ -263,17 +288,26 @@ def bootstrap_theta(
     withheld = plug_in.withheld
     if not withheld and error < LEAST_RESAMPLED * plug_in.standard_error:
         withheld = "the resamples vary less than the draws: pairs that matter were drawn too few times"
-    return Estimate("theta", plug_in.value + plug_in.bias, error, samples=np.array(samples), withheld=withheld)
+    return Estimate(
+        "theta", plug_in.value + plug_in.bias, error, np.array(samples), withheld=withheld, warning=plug_in.warning
+    )
 
 
-def _plug_in(model: EmpiricalMDP, empirical: EmpiricalProblem, policy: np.ndarray, optimal: bool) -> Estimate:
-    """J of ``policy`` [n, A], on the problem's states; ``optimal``: the policy moves with the data."""
+def _plug_in(
+    model: EmpiricalMDP,
+    empirical: EmpiricalProblem,
+    policy: np.ndarray,
+    optimal: bool,
+    value: np.ndarray | None = None,
+) -> Estimate:
+    """J of ``policy`` [n, A], on the problem's states; ``optimal``: the policy moves with the data. ``value`` [n]: its
+    relative value, about, where that is known."""
     problem = empirical.problem
-    here = _worth(problem, policy)
-    d, value = np.zeros(model.visits.shape), np.zeros(model.n_states)
-    d[problem.states], value[problem.states] = here.d, here.value
+    here = _worth(problem, policy, value)
+    d = np.zeros(model.visits.shape)
+    d[problem.states] = here.d
     with np.errstate(over="ignore", invalid="ignore"):
-        rows = _rows(model, empirical, value)
+        rows = _rows(model, empirical, here)
         weight = np.where(empirical.used, d**2 / np.maximum(rows.n, 1.0), 0.0)
         variance = weight * rows.variance
         total = float(variance.sum())
@@ -294,6 +328,7 @@ def _plug_in(model: EmpiricalMDP, empirical: EmpiricalProblem, policy: np.ndarra
         untried=(0.0, untried),
         smallest_visits=int(model.visits.flat[counts].min()) if counts.size else None,
         withheld=_same_reward(model, empirical) or _withheld(total, bias, untried),
+        warning=_warning(model, rows, counts),
     )
     if estimate.withheld:  # the correction cannot be trusted
         return replace(estimate, value=here.gain, bias=0.0)
@@ -318,20 +353,63 @@ class _Worth(NamedTuple):
     gain: float  # J
     d: np.ndarray  # its stationary distribution over pairs, [n, A]
     value: np.ndarray  # relative, [n]
+    certain: np.ndarray  # C V, [n*A]; none at optimism 0
+    tilted: np.ndarray  # q, as the data of the transitions; none at optimism 0
 
 
-def _worth(problem: BellmanProblem, policy: np.ndarray) -> _Worth:
+def _worth(problem: BellmanProblem, policy: np.ndarray, value: np.ndarray | None = None) -> _Worth:
+    """By Newton's method from ``value`` [n] (None: 0) above optimism 0 and below."""
     prior = np.where(policy > 0, problem.prior, 1.0)
-    lu = problem.regeneration(policy)
-    gain, value = lu.poisson((policy * problem.reward).sum(1) - kl_per_state(policy, prior) / problem.beta)
-    return _Worth(gain, lu.stationary()[:, None] * policy, value)
+    reward = (policy * problem.reward).sum(1) - kl_per_state(policy, prior) / problem.beta
+    if not problem.optimism:
+        lu = problem.regeneration(policy)
+        gain, value = lu.poisson(reward)
+        return _Worth(gain, lu.stationary()[:, None] * policy, value, np.empty(0), np.empty(0))
+    ref = problem.regeneration_state()
+    if ref is None:
+        raise SingularChainError("several closed classes")
+
+    def backed_up(value: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(T V - V of the policy [n], C V [n*A], q)."""
+        log_mean, _, tilted = problem.tilt(problem.kappa * value)
+        certain = log_mean / problem.kappa
+        return reward + (policy * certain.reshape(policy.shape)).sum(1) - value, certain, tilted
+
+    value = np.zeros(problem.n_states) if value is None else value - value[ref]
+    change, certain, tilted = backed_up(value)
+    for _ in range(MAX_STEPS):
+        lu = problem.regeneration(policy, ref, tilted)
+        step, share = lu.poisson(change)[1], 1.0
+        while True:
+            there = backed_up(value + share * step)
+            if np.ptp(there[0]) < np.ptp(change) or share < SMALLEST_SHARE:
+                break
+            share *= 0.5
+        if not np.ptp(there[0]) < np.ptp(change):
+            break
+        small = not np.ptp(there[0]) < STALLED * np.ptp(change)
+        value, (change, certain, tilted) = value + share * step, there
+        if small and share == 1:
+            break
+    if not np.ptp(change) <= UNSOLVED * problem.reward_range:
+        raise SingularChainError("no relative value")
+    lu = problem.regeneration(policy, ref, tilted)
+    d = lu.stationary()
+    return _Worth(float(d @ change), d[:, None] * policy, value, certain, tilted)
+
+
+def _effect(problem: BellmanProblem, here: _Worth, to: np.ndarray, row: np.ndarray) -> np.ndarray:
+    """What a share of probability of the successors ``to`` adds to J in ``row`` (of [n*A]): V(s'), or xi - 1/kappa."""
+    if not problem.optimism:
+        return np.asarray(here.value[to])
+    return np.asarray(np.expm1(problem.kappa * (here.value[to] - here.certain[row])) / problem.kappa)
 
 
 def _optimum(problem: BellmanProblem, value: np.ndarray, tol: float) -> _Worth:
     """Those of the optimal policy, to ``tol`` in J, by soft policy iteration from ``value`` [n]."""
     last = -np.inf
     for _ in range(MAX_STEPS):
-        worth = _worth(problem, soft_backup(problem.action_value(value), problem.prior, problem.beta)[1])
+        worth = _worth(problem, soft_backup(problem.action_value(value), problem.prior, problem.beta)[1], value)
         if not worth.gain > last + tol:
             break
         last, value = worth.gain, worth.value
@@ -339,16 +417,17 @@ def _optimum(problem: BellmanProblem, value: np.ndarray, tol: float) -> _Worth:
 
 
 class _Rows(NamedTuple):
-    """Statistics of x = r + V(s') over the draws of each pair, [S, A] each."""
+    """Statistics of x = r + V(s'), or r + xi, over the draws of each pair, [S, A] each."""
 
     n: np.ndarray  # draws whose s' is in the problem
     share: np.ndarray  # of each transition entry among them, [nnz]
     x: np.ndarray  # mean of x given s', less the row's mean, [nnz]
     noise: np.ndarray  # variance of r given s', mean over s'
     variance: np.ndarray  # of x; divisor n - 1, as that of noise
+    ratio: np.ndarray  # q/p, [nnz]; 1 at optimism 0
 
 
-def _rows(model: EmpiricalMDP, empirical: EmpiricalProblem, value: np.ndarray) -> _Rows:
+def _rows(model: EmpiricalMDP, empirical: EmpiricalProblem, here: _Worth) -> _Rows:
     p, shape = model.transition, model.visits.shape
     members = np.asarray(empirical.used.any(1))
     rows = np.repeat(np.arange(model.visits.size), np.diff(p.indptr))
@@ -357,7 +436,16 @@ def _rows(model: EmpiricalMDP, empirical: EmpiricalProblem, value: np.ndarray) -
     n = model.visits.ravel() * total
     with np.errstate(invalid="ignore", divide="ignore"):
         share = np.where(kept > 0, kept / total[rows], 0.0)
-    x = model.reward_given_next + value[p.indices]
+    problem = empirical.problem
+    value, ratio = np.zeros(model.n_states), np.ones(p.nnz)
+    value[problem.states] = here.value
+    effect = value[p.indices]
+    if problem.optimism:
+        certain = np.zeros(model.visits.shape)
+        certain[problem.states] = here.certain.reshape(problem.reward.shape)
+        exponent = np.where(kept > 0, problem.kappa * (effect - certain.ravel()[rows]), 0.0)
+        ratio, effect = np.exp(exponent), np.expm1(exponent) / problem.kappa
+    x = model.reward_given_next + effect
     x = x - np.bincount(rows, share * x, model.visits.size)[rows]
     unbiased = np.where(n > 1.5, n / np.maximum(n - 1, 1), 1.0)
     noise = _within(model, share, rows) * unbiased
@@ -368,7 +456,7 @@ def _rows(model: EmpiricalMDP, empirical: EmpiricalProblem, value: np.ndarray) -
     for each in (noise, variance):
         each[once] = each[used & ~once].max(initial=0.0)
         each[~used] = 0.0
-    return _Rows(n.reshape(shape), share, x, noise.reshape(shape), variance.reshape(shape))
+    return _Rows(n.reshape(shape), share, x, noise.reshape(shape), variance.reshape(shape), ratio)
 
 
 def _furthest(
@@ -398,7 +486,7 @@ def _furthest(
     weights, weighed, steps, idle = np.zeros(len(n)), np.zeros(p.nnz), 0, 0
     for _ in range(MAX_STEPS):
         d = now.d.ravel()
-        x = given + now.value[p.indices]
+        x = given + _effect(problem, now, p.indices, row)
         x = x - np.add.reduceat(p.data * x, p.indptr[:-1])[row]
         if tied:
             steps, weights, weighed = steps + 1, weights + d, weighed + d[row] * x
@@ -423,16 +511,12 @@ def _furthest(
         log_price = _root(spent)
         spent(log_price)
         reward = np.add.reduceat(moved * given, p.indptr[:-1]) + slope * np.exp(-log_price) * noise
-        model_there = replace(
-            problem,
-            transition=sp.csr_array((moved.copy(), p.indices, p.indptr), shape=p.shape),
-            reward=problem.reward + reward.reshape(problem.reward.shape),
-        )
+        model_there = _with_rows(problem, p, moved, reward)
         try:
             if optimal:
                 now = _optimum(model_there, now.value, 0.1 * END_TOLERANCE * abs(best - here.gain))
             else:
-                now = _worth(model_there, policy)
+                now = _worth(model_there, policy, now.value)
         except SingularChainError:
             return sign * np.inf
         gained = sign * (now.gain - best)
@@ -445,6 +529,14 @@ def _furthest(
             if not tied or idle == PATIENCE:
                 return best
     return best
+
+
+def _with_rows(problem: BellmanProblem, p: sp.csr_array, moved: np.ndarray, reward: np.ndarray) -> BellmanProblem:
+    """``problem`` with rows ``moved`` (the data of ``p``), and ``reward`` [n*A] added."""
+    transition = sp.csr_array((moved.copy(), p.indices.copy(), p.indptr.copy()), shape=p.shape)
+    if problem.optimism:  # the tilt is of successors that there are
+        transition.eliminate_zeros()
+    return replace(problem, transition=transition, reward=problem.reward + reward.reshape(problem.reward.shape))
 
 
 def _root(falling: Callable[[float], float]) -> float:
@@ -506,16 +598,20 @@ def _second_order(
 ) -> tuple[float, float]:
     """(how far noise in the rows moves J on average, standard error of that); docs/theory.md, 4.
 
-    With e(s,a) the error of the mean of r + V(s') and Z = (I - K + 1 d)^-1: dV = Z (sum_a pi e), and on average over d
+    At optimism 0, with e(s,a) the error of the mean of r + V(s') and Z = (I - K + 1 d)^-1: dV = Z (sum_a pi e), and on
+    average over d
 
         sum_a pi (dp dV) + (beta/2) Var_pi(e + p dV),        the second term if the policy moves along.
+
+    Otherwise e is that of r + xi, K and p dV become those of q, dp dV becomes dp (q/p) (dV - q dV), and
+    (kappa/2) (Var_q(dV) - Var_p(xi)/n) is added: C has a second order of its own.
 
     That is tr(M Z) + sum |H Z diag(source)^1/2|^2, column by column; of more than BIAS_STATES states, the mean over
     random signs in place of columns (Hutchinson).
     """
     problem = empirical.problem
     states, n, n_actions = problem.states, problem.n_states, problem.n_actions
-    lu, d = problem.regeneration(policy), here.d.sum(1)
+    lu, d, follows = _process(problem, policy, here), here.d.sum(1), problem.transition
     draws = np.maximum(rows.n, 1.0)
     measured = empirical.used & (rows.n > 1.5)  # the variance of one draw is set by a rule, not measured
     noise = np.where(measured, rows.variance / draws, 0.0)[states]
@@ -529,14 +625,23 @@ def _second_order(
     entry = (rows.share > 0) & measured.ravel()[pair]
     together = (weight / draws).ravel()[pair[entry]] * (rows.share * rows.x)[entry]
     at = place[pair[entry] // n_actions], place[p.indices[entry]]
+    moved, kappa = 0.0, problem.kappa
+    if kappa:
+        follows = sp.csr_array((here.tilted, follows.indices, follows.indptr), shape=follows.shape)
+        together = together * rows.ratio[entry]
     matrix = sp.csr_array((together, at), shape=(n, n))
-    moved = 0.0
+    if kappa:
+        whole = np.bincount(pair[entry], together, model.visits.size).reshape(model.visits.shape)[states]
+        matrix = matrix - _by_state(whole) @ follows
+        squares = rows.share * ((rows.ratio - 1) / kappa) ** 2
+        excess = np.bincount(pair[entry], squares[entry], model.visits.size)
+        own = (excess.reshape(draws.shape) / np.maximum(draws - 1, 1))[states]
+        moved = -0.5 * kappa * float((here.d * own).sum())  # of C
     source = (policy**2 * noise).sum(1)  # variance of sum_a pi e, state by state
     if optimal:
-        moved = 0.5 * problem.beta * float((here.d * (1 - policy) * noise).sum())  # Var_pi(e)
+        moved += 0.5 * problem.beta * float((here.d * (1 - policy) * noise).sum())  # Var_pi(e)
         both = problem.beta * d[:, None] * policy * (policy * noise - source[:, None])
-        choose = sp.csr_array((both.ravel(), np.arange(both.size), np.arange(0, both.size + 1, n_actions)))
-        matrix = matrix + choose @ problem.transition
+        matrix = matrix + _by_state(both) @ follows
 
     def through(x: np.ndarray) -> np.ndarray:
         """Z x."""
@@ -547,14 +652,45 @@ def _second_order(
     terms = []
     for x in np.eye(n) if exact else np.random.default_rng(0).choice([-1.0, 1.0], (SIGNS, n)):
         term = float(x @ (matrix @ through(x)))
+        if kappa:
+            moves = through(np.sqrt(source) * x)
+            term += 0.5 * kappa * float(here.d.ravel() @ (follows @ moves**2 - (follows @ moves) ** 2))  # Var_q(dV)
         if optimal:
-            h = (problem.transition @ through(np.sqrt(source) * x)).reshape(n, n_actions)
+            h = (follows @ through(np.sqrt(source) * x)).reshape(n, n_actions)
             h = h - (policy * h).sum(1, keepdims=True)
             term += 0.5 * problem.beta * float((here.d * h**2).sum())  # Var_pi(p dV)
         terms.append(term)
     if exact:
         return moved + sum(terms), 0.0
     return moved + float(np.mean(terms)), float(np.std(terms, ddof=1) / np.sqrt(SIGNS))
+
+
+def _process(problem: BellmanProblem, policy: np.ndarray, here: _Worth) -> RegenerativeLU:
+    """The LU of the chain of ``policy`` [n, A] and q."""
+    return problem.regeneration(policy, tilted=here.tilted if problem.optimism else None)
+
+
+def _by_state(table: np.ndarray) -> sp.csr_array:
+    """Rows [n, n*A] that weigh the pairs of each state by ``table`` [n, A]."""
+    ends = np.arange(0, table.size + 1, table.shape[1])
+    return sp.csr_array((table.ravel(), np.arange(table.size), ends))
+
+
+def _warning(model: EmpiricalMDP, rows: _Rows, counts: np.ndarray) -> str:
+    """That a pair among ``counts`` (of [S*A]) has a successor of whose weight q/p few tuples tell; "" if none has."""
+    p = model.transition
+    pair = np.repeat(np.arange(model.visits.size), np.diff(p.indptr))
+    ratio = np.where((rows.share > 0) & np.isin(pair, counts), rows.ratio, 0.0)
+    draws = rows.n.ravel()[pair]
+    over = ratio / np.sqrt(np.maximum(draws, 1.0))
+    worst = int(np.argmax(over))
+    if not over[worst] > 1:
+        return ""
+    s, a = divmod(int(pair[worst]), model.n_actions)
+    return (
+        f"at state {s}, action {a} the successor {p.indices[worst]} counts {ratio[worst]:.3g} times its share of "
+        f"{draws[worst]:.0f} tuples: what the data say rests on a handful of them"
+    )
 
 
 def _luck(empirical: EmpiricalProblem, here: _Worth, rows: _Rows, policy: np.ndarray) -> float:

@@ -1,7 +1,8 @@
 """Certainty equivalence: count, then solve the empirical model exactly. The yardstick of every tabular learner.
 
-Objective: the average reward minus KL(pi || prior)/beta, that of Algorithm S1; not optimistic. The optimum is over
-the visited pairs of the class of states that the stream shows (``erl_torch.empirical.counts``); states outside keep
+Objective: the average reward minus KL(pi || prior)/beta, that of Algorithm S1; not optimistic, unless ``optimism`` says
+so: then (1/kappa) log E exp(kappa V(s')) stands in the place of E V, kappa = optimism * beta. The optimum is over the
+visited pairs of the class of states that the stream shows (``erl_torch.empirical.counts``); states outside keep
 the prior. The policy's loss in the true MDP, g* - J, falls as 1/tuples: it is what the data allow.
 
 The action a' of the stream is not used, and the stream may come from any behaviour policy.
@@ -18,7 +19,7 @@ import numpy as np
 import torch
 
 from erl_torch import checks
-from erl_torch.empirical.counts import EmpiricalMDP, EmpiricalProblem, empirical_mdp
+from erl_torch.empirical.counts import NOISE, EmpiricalMDP, EmpiricalProblem, empirical_mdp, joint
 from erl_torch.experience.experience import Experience
 from erl_torch.learners.learner import StreamLearner, columns, message
 from erl_torch.mdp.tabular import check_policy, check_prior
@@ -74,9 +75,12 @@ class CertaintyEquivalence(StreamLearner[CertaintyEquivalenceState, CertaintyEqu
 
     Args:
         beta: inverse temperature, 1/reward, > 0.
+        optimism: 1 optimistic (control as inference), 0 right (the paper), negative robust; any number.
         tol: width of the bounds on the empirical theta* to stop at, relative to the range of the rewards.
         max_steps: Newton steps at most.
         prior_policy: [S, A], 0 where an action is not to be taken; None is uniform.
+        reward_noise: "mean": r(s,a) is the mean reward. "joint": rewards that vary for the same (s,a) count together
+            with s', as in ``erl_torch.empirical.counts.joint``; the same at optimism 0.
 
     Raises:
         InputError: an argument out of its range.
@@ -86,19 +90,24 @@ class CertaintyEquivalence(StreamLearner[CertaintyEquivalenceState, CertaintyEqu
     stream_bytes: ClassVar[int] = 1  # counts alone
 
     beta: float = 10.0
+    optimism: float = 0.0
     tol: float = 1e-10
     max_steps: int = 200
     prior_policy: torch.Tensor | np.ndarray | None = None
+    reward_noise: str = "mean"
 
     def __post_init__(self) -> None:
         checks.plain(self)
         checks.temperature("beta", self.beta)
+        checks.optimism("optimism", self.optimism, self.beta)
+        checks.one_of("reward_noise", self.reward_noise, NOISE)
         checks.positive("tol", self.tol)
         checks.at_least("max_steps", self.max_steps, 1)
 
     def fit(self, transitions: Experience, n_states: int, n_actions: int) -> Solution:
         """Count and solve. Status REDUCIBLE, with a message, where the states that the stream shows are not one
-        recurrent class; theta is then that of the closed set of states (of several, the most visited)."""
+        recurrent class; theta is then that of the closed set of states (of several, the most visited). NO_SINGLE_RATE,
+        below optimism 0, where the data have none: then there is no theta."""
         return super().fit(transitions, n_states, n_actions)
 
     def finished(self, state: CertaintyEquivalenceState) -> bool:
@@ -114,7 +123,10 @@ class CertaintyEquivalence(StreamLearner[CertaintyEquivalenceState, CertaintyEqu
     def prepare(self, transitions: Experience, n_states: int, n_actions: int) -> CertaintyEquivalenceStream:
         """Count. Raises InputError for tuples out of range, or a stream that never returns to any state."""
         model = empirical_mdp(transitions, n_states, n_actions)
-        return CertaintyEquivalenceStream(model, model.problem(self.beta, self.prior_policy), len(transitions))
+        if self.reward_noise == "joint":
+            model = joint(model, transitions, self.optimism * self.beta)
+        empirical = model.problem(self.beta, self.prior_policy, optimism=self.optimism)
+        return CertaintyEquivalenceStream(model, empirical, len(transitions))
 
     def step(self, state: CertaintyEquivalenceState, stream: CertaintyEquivalenceStream) -> CertaintyEquivalenceState:
         """Solve. Pure: ``state`` is left as it is."""
@@ -123,7 +135,9 @@ class CertaintyEquivalence(StreamLearner[CertaintyEquivalenceState, CertaintyEqu
         assert answer.theta_bounds is not None
         lower, upper = answer.theta_bounds
         theta, message, status = answer.theta, part.message, Status.REDUCIBLE if part.reducible else answer.status
-        if theta is None:  # states are left for ever in the data, where other states may be better
+        if answer.status is Status.NO_SINGLE_RATE:
+            message = "; ".join(filter(None, (part.message, answer.message, proven((lower, upper), None))))
+        elif theta is None:  # states are left for ever in the data, where other states may be better
             ending = solve_problem(part.problem.ending(), stream.model, None, self.tol, self.max_steps)
             theta = ending.theta
             assert theta is not None
@@ -132,8 +146,9 @@ class CertaintyEquivalence(StreamLearner[CertaintyEquivalenceState, CertaintyEqu
             message = "; ".join(
                 filter(None, (part.message, answer.message, f"in the data, {proven((lower, upper), None)}"))
             )
+        estimate = 0.5 * (lower + upper) if theta is None else theta
         with np.errstate(over="ignore", under="ignore"):
-            rho = float(np.exp(-self.beta * (theta + answer.reward_bias_max))) if answer.rho is None else answer.rho
+            rho = float(np.exp(-self.beta * (estimate + answer.reward_bias_max))) if answer.rho is None else answer.rho
         known = torch.from_numpy(part.used | ~part.used.any(1, keepdims=True))
         reward_bias = answer.reward_bias
         if self.prior_policy is not None:  # actions that a state lacks have none
@@ -144,7 +159,7 @@ class CertaintyEquivalence(StreamLearner[CertaintyEquivalenceState, CertaintyEqu
             u=answer.u * known,
             reward_bias=reward_bias,
             theta=theta,
-            rho=rho,
+            rho=None if theta is None else rho,
             theta_bounds=None,  # what is proven of the empirical model is not proven of the true one
             gap=None,
             n_steps=stream.n_tuples,
@@ -158,7 +173,7 @@ class CertaintyEquivalence(StreamLearner[CertaintyEquivalenceState, CertaintyEqu
             policy=answer.policy,
             u=answer.u,
             rho=rho,
-            theta=theta,
+            theta=estimate,
             reward_bias=reward_bias,
             empirical_width=upper - lower,
             answer=answer,
@@ -183,5 +198,6 @@ class CertaintyEquivalence(StreamLearner[CertaintyEquivalenceState, CertaintyEqu
             status=self.ended(state, failure),
             message=message(failure),
             beta=self.beta,
+            optimism=self.optimism,
         )
         return replace(answer, history=columns(history))

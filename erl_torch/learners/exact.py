@@ -63,6 +63,7 @@ class Exact:
 
     Args:
         beta: inverse temperature, 1/reward, > 0.
+        optimism: 1 optimistic (control as inference), 0 right (the paper), negative robust; any number.
         method: "biasing" or "soft_bellman".
         tol: width of the bounds on theta* to stop at, as in ``solve_soft_bellman``.
         max_steps: iterations at most.
@@ -78,8 +79,11 @@ class Exact:
     quantities: ClassVar[tuple[Quantity, ...]] = ()
     averages_exp_reward: ClassVar[bool] = False
     drawn_from_prior: ClassVar[str] = ""
+    reward_noise: ClassVar[str] = "mean"
+    assumed_optimism: ClassVar[float | None] = None
 
     beta: float = 10.0
+    optimism: float = 0.0
     method: str = "biasing"
     tol: float = 1e-10
     max_steps: int = 200
@@ -88,6 +92,7 @@ class Exact:
     def __post_init__(self) -> None:
         checks.plain(self)
         checks.temperature("beta", self.beta)
+        checks.optimism("optimism", self.optimism, self.beta)
         checks.one_of("method", self.method, ("biasing", "soft_bellman"))
         checks.positive("tol", self.tol)
         checks.at_least("max_steps", self.max_steps, 1)
@@ -95,7 +100,8 @@ class Exact:
     def solve(self, mdp: TabularMDP) -> Solution:
         """The solution with its certificate."""
         solve = solve_biasing if self.method == "biasing" else solve_soft_bellman
-        return solve(mdp, self.beta, self.prior_policy, tol=self.tol, max_steps=self.max_steps)
+        given = mdp, self.beta, self.prior_policy
+        return solve(*given, tol=self.tol, max_steps=self.max_steps, optimism=self.optimism)
 
     def init(self, n_states: int, n_actions: int) -> ExactState:
         """The prior policy, before anything is known."""
@@ -105,7 +111,7 @@ class Exact:
 
     def iterate(self, mdp: TabularMDP) -> Iterator[ExactState]:
         """Yield each iteration until the bounds are within ``tol``."""
-        problem = BellmanProblem.of(mdp, self.beta, self.prior_policy)
+        problem = BellmanProblem.of(mdp, self.beta, self.prior_policy, self.optimism)
         prior = check_prior("prior_policy", self.prior_policy, mdp.n_states, mdp.n_actions, mdp.allowed)
         ref = problem.regeneration_state()
         if ref is None or (self.method == "biasing" and len(problem.classes[1]) > 1):
@@ -129,7 +135,8 @@ class Exact:
                 if newton.step or problem.is_narrow(newton.theta_bounds, self.tol, newton.policy):
                     yield full(newton.step, newton, 0.5 * sum(newton.theta_bounds), 0.0)
             return
-        for state in iterate_biasing(mdp, self.beta, self.prior_policy, max_steps=self.max_steps):
+        given = mdp, self.beta, self.prior_policy
+        for state in iterate_biasing(*given, max_steps=self.max_steps, optimism=self.optimism):
             yield full(state.k + 1, state, state.theta, float(state.kl.max()))
             if problem.is_narrow(state.theta_bounds, self.tol, state.policy):
                 return
@@ -180,7 +187,7 @@ class Exact:
         """The solution that ``state`` (of ``start`` or ``iterate``) stands for; STOPPED with any ``failure``."""
         mdp = state.mdp
         assert mdp is not None
-        problem = BellmanProblem.of(mdp, self.beta, self.prior_policy)
+        problem = BellmanProblem.of(mdp, self.beta, self.prior_policy, self.optimism)
         prior = check_prior("prior_policy", self.prior_policy, mdp.n_states, mdp.n_actions, mdp.allowed)
         if not len(state.value):  # no iteration could be made
             none = reducible_solution(mdp, problem, prior)

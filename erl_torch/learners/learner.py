@@ -133,12 +133,24 @@ class TabularLearner(Learner[S, Experience, Solution], Protocol[S]):
         """Inverse temperature, 1/reward."""
 
     @property
+    def optimism(self) -> float:
+        """Of the problem that it is held against: 1 optimistic (control as inference), 0 right, negative robust."""
+
+    @property
+    def reward_noise(self) -> str:
+        """How rewards that vary for the same (s,a) count in that problem: by their "mean", or "joint" with s'."""
+
+    @property
     def prior_policy(self) -> Table:
         """[S, A], 0 where a state does not have the action; None is uniform."""
 
     @property
     def averages_exp_reward(self) -> bool:
         """Whether noise in r counts as reward."""
+
+    @property
+    def assumed_optimism(self) -> float | None:
+        """Of the dynamics, of a learner that has no choice in it, where that is not 0: of U-learning 1."""
 
     @property
     def drawn_from_prior(self) -> str:
@@ -170,6 +182,9 @@ class StreamLearner(ABC, Generic[T, Prepared]):
     stream_bytes: ClassVar[int] = 40  # memory of a tuple in ``prepare``d experience
 
     beta: float
+    optimism: float = 0.0
+    reward_noise: str = "mean"
+    assumed_optimism: ClassVar[float | None] = None
     prior_policy: Table
 
     @property

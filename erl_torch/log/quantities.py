@@ -222,7 +222,7 @@ QUANTITIES = (
         "J: reward rate minus KL(policy \\|\\| prior)/beta a step. Stationary and exact where the model is known (only"
         " somewhere between its bounds where products of probabilities underflow); otherwise over the sampled "
         "episodes; of a log alone, in the model of its counts. Its maximum is -theta, so compare it with minus "
-        "`learner/theta`",
+        "`learner/theta`. Of a learner with `optimism`: the nested J at that optimism",
         _FIGURE,
         board=RETURNS,
         chart="objective; optimal, prior",
@@ -230,6 +230,20 @@ QUANTITIES = (
         replicas=True,
         result="objective",
         digits=".5f",
+    ),
+    Quantity(
+        "objective_real",
+        RATE,
+        "J at optimism 0, where the learner's is another: what the policy is worth in the real world, less KL/beta. Of "
+        "the optimum: what the optimal policy of that optimism is worth there",
+        _FIGURE,
+        board=RETURNS,
+        chart="objective in the real world; optimal, prior",
+        label="objective J in the real world",
+        replicas=True,
+        result="objective_real",
+        digits=".5f",
+        row="... really",
     ),
     Quantity(
         "return",
@@ -265,8 +279,8 @@ QUANTITIES = (
 )
 BY_NAME = {quantity.name: quantity for quantity in QUANTITIES}
 # What pictures and lines of replicas show, in their order.
-BANDS = ("theta", "delta_max", "reward_per_step", "objective", "return", "success_rate")
-SWEEP = ("theta", "objective", "delta_max")
+BANDS = ("theta", "delta_max", "reward_per_step", "objective", "objective_real", "return", "success_rate")
+SWEEP = ("theta", "objective", "objective_real", "delta_max")
 PROGRESS = ("theta", "delta_max", "reward_per_step", "objective")
 
 

@@ -5,6 +5,7 @@ learning curve, each time from scratch. Each policy pi is measured exactly on th
 
     gap          g* - J(pi), reward a step: J = reward rate - KL(pi || prior)/beta, g* = -theta* its maximum.
                  Computed as (1/beta) E_{d_pi} KL(pi || pi*), which is the same and loses no digits near the optimum
+                 (of learners with ``optimism``: J is the nested one, and all have the same)
     kl           sum_s d*(s) KL(pi*(.|s) || pi(.|s)), nats, d* the stationary distribution of pi*
     kl_states    mean over all states of the same KL
     theta_error  |theta - theta*|, reward a step; NaN where the learner estimates no theta
@@ -43,6 +44,7 @@ from erl_torch.learners.s1 import kernels
 from erl_torch.mdp.tabular import TabularMDP, check_policy
 from erl_torch.notes import collected
 from erl_torch.run.build import learner_class, make_env, make_learner, make_source, make_world
+from erl_torch.run.report import at
 from erl_torch.run.settings import check_comparison_keys
 from erl_torch.solution import Status
 from erl_torch.solvers.optimum import Optimum, measure, solve_optimum
@@ -60,6 +62,7 @@ class Comparison:
     seeds: tuple[int, ...]
     sizes: tuple[int, ...]  # tuples of experience, ascending; the last is the whole stream
     beta: float
+    optimism: float
     theta: float  # theta*, of the model
     measures: dict[str, np.ndarray]
     status: dict[str, list[list[str]]]  # a learner: [seeds][sizes], lower-case names of Status
@@ -79,6 +82,7 @@ class Comparison:
         }
         return {
             "beta": self.beta,
+            "optimism": self.optimism,
             "theta": self.theta,
             "seeds": list(self.seeds),
             "sizes": list(self.sizes),
@@ -130,7 +134,8 @@ def compare(
 
     Args:
         mdp: the known model; the tuples are drawn from it.
-        learners: by name; anything with ``beta``, ``prior_policy`` and ``fit``. All have one beta and one prior.
+        learners: by name; anything with ``beta``, ``optimism``, ``prior_policy`` and ``fit``. All have one beta, one
+            optimism and one prior.
         n_episodes, episode_length: the stream of a seed is n_episodes * episode_length tuples.
         seeds: a number (0, 1, ...) or the seeds themselves; the streams are those of ``collect`` with that seed.
         behaviour_policy: [S, A]; None is the prior.
@@ -140,7 +145,8 @@ def compare(
         report: called with (fits done, fits in all).
 
     Raises:
-        InputError: an argument out of range; learners of different beta or prior; a model without one optimum.
+        InputError: an argument out of range; learners of different beta, optimism or prior; a model that has not one
+            optimum.
     """
     names = tuple(learners)
     if not names:
@@ -155,14 +161,17 @@ def compare(
     checks.workers("processes", processes)
     prior = check_policy("prior_policy", prior_policy, mdp.n_states, mdp.n_actions, mdp.allowed)
     learners = {name: with_prior(learner, mdp.allowed) for name, learner in learners.items()}
-    beta = learners[names[0]].beta
+    beta, optimism = learners[names[0]].beta, learners[names[0]].optimism
     for name, learner in learners.items():
         if learner.beta != beta:
             raise InputError(f"{name}: beta", learner.beta, f"that of {names[0]}, {beta:g}: one objective for all")
+        if learner.optimism != optimism:
+            allowed = f"that of {names[0]}, {optimism:g}: one objective for all"
+            raise InputError(f"{name}: optimism", learner.optimism, allowed)
         its = check_policy(f"{name}: prior_policy", learner.prior_policy, mdp.n_states, mdp.n_actions, mdp.allowed)
         if not np.allclose(its, prior, rtol=0, atol=1e-12):
             raise InputError(f"{name}: prior_policy", "array", "the prior of the comparison: one objective for all")
-    best = solve_optimum(mdp, beta, prior)
+    best = solve_optimum(mdp, beta, prior, optimism=optimism)
     sizes = _sizes(n_episodes * episode_length, n_sizes)
     experience = (mdp, n_episodes, episode_length)
     jobs = {
@@ -178,7 +187,7 @@ def compare(
                 measures[name][i, j, k] = figures[name]
             status[names[i]][j][k] = ended.name.lower()
         report(done, len(jobs))
-    return Comparison(names, seeds, sizes, beta, best.theta, measures, status)
+    return Comparison(names, seeds, sizes, beta, optimism, best.theta, measures, status)
 
 
 # -- its parts ----------------------------------------------------------------------------------------
@@ -217,7 +226,12 @@ def _run(
         began = time.perf_counter()
         solution = learner.fit(data.first(size), mdp.n_states, mdp.n_actions)
         seconds = time.perf_counter() - began
-        rows.append((measure(mdp, best, solution, learner.beta) | {"seconds": seconds}, solution.status))
+        rows.append(
+            (
+                measure(mdp, best, solution, learner.beta, prior, optimism=learner.optimism) | {"seconds": seconds},
+                solution.status,
+            )
+        )
     return rows
 
 
@@ -313,8 +327,8 @@ def run_comparison(cfg: DictConfig, directory: Path, safe_point: Callable[[], No
     learners = {}
     for name in cfg.learners:
         settings = cfg.learner[name].copy()
-        for key in ("beta", "prior_policy"):
-            if cfg[key] is not None:
+        for key in ("beta", "optimism", "prior_policy"):
+            if cfg[key] is not None and (key != "optimism" or key in settings):
                 settings[key] = cfg[key]
         learners[name] = make_learner(settings, mdp.n_states, mdp.n_actions, f"learner.{name}")
     behaviour = cfg.experience.behaviour_policy
@@ -342,7 +356,7 @@ def run_comparison(cfg: DictConfig, directory: Path, safe_point: Callable[[], No
         )
     result = {"env": cfg.env.name, **found.summary(), "seconds": round(time.perf_counter() - began, 1)}
     write_json(directory / "compare.json", result)
-    title = f"{cfg.env.name}, beta {found.beta:g}: {len(found.seeds)} seeds"
+    title = f"{cfg.env.name}, {at(found.beta, found.optimism)}: {len(found.seeds)} seeds"
     write_png(directory / "compare.png", pictures.learning_curves(result["sizes"], result["curves"], title))
     print(f"\n{title}, {found.sizes[-1]:,} tuples each, theta* {found.theta:.7f}\n\n{found.table()}")
     print("\ngap: mean over seeds, interquartile mean and its interval (Student's t); other columns: means")

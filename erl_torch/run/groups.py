@@ -29,6 +29,7 @@ class Group:
     settings: Mapping[str, Any]  # those that vary
     members: slice | np.ndarray  # of all replicas
     beta: float
+    optimism: float = 0.0
 
     @property
     def name(self) -> str:
@@ -48,14 +49,16 @@ def setting_text(setting: object) -> str:
     return short if float(short) == setting else repr(setting)
 
 
-def groups_of(vary: Mapping[str, Any], n_replicas: int, settings: Mapping[str, Any], beta: float) -> list[Group]:
+def groups_of(
+    vary: Mapping[str, Any], n_replicas: int, settings: Mapping[str, Any], beta: float, optimism: float = 0.0
+) -> list[Group]:
     """Every combination of the values that vary, in their order: ``n_replicas`` of each.
 
     Args:
         vary: a number, or a list of numbers, by the setting that takes them.
         n_replicas: in each group.
         settings: those of the learner, by name.
-        beta: of the learner, where it does not vary.
+        beta, optimism: of the learner, where they do not vary.
 
     Raises:
         InputError: a key that is no setting of the learner, or values that are not numbers.
@@ -77,7 +80,8 @@ def groups_of(vary: Mapping[str, Any], n_replicas: int, settings: Mapping[str, A
     for i, values in enumerate(itertools.product(*columns.values())):
         varied = dict(zip(columns, values, strict=True))
         members = slice(i * n_replicas, (i + 1) * n_replicas)
-        groups.append(Group(varied, members, float(varied.get("beta", beta))))
+        of = float(varied.get("beta", beta)), float(varied.get("optimism", optimism))
+        groups.append(Group(varied, members, *of))
     return groups
 
 
@@ -92,7 +96,8 @@ def groups_among(learners: Sequence[StreamLearner[Any, Any]]) -> tuple[list[Grou
     groups = []
     for rows in members.values():
         first = learners[rows[0]]
-        groups.append(Group({name: getattr(first, name) for name in names}, np.array(rows), float(first.beta)))
+        settled = {name: getattr(first, name) for name in names}
+        groups.append(Group(settled, np.array(rows), float(first.beta), float(first.optimism)))
     firsts = [rows[0] for rows in members.values()]
     vary = {name: {told[r][name]: getattr(learners[r], name) for r in firsts} for name in names}
     return groups, {name: list(values.values()) for name, values in vary.items()}

@@ -23,15 +23,21 @@ from erl_torch.solvers.chains import SingularChainError
 SMALL = 2000  # states of a model, or that a stream meets, up to which it is solved beside every run
 
 
-def of_data(model: EmpiricalMDP | None, beta: float, prior: np.ndarray) -> Estimate:
+def of_data(
+    model: EmpiricalMDP | None, beta: float, prior: np.ndarray, optimism: float = 0.0, reward_noise: str = "mean"
+) -> Estimate:
     """theta* with its error, as a stream alone has it; withheld, with a value of NaN, where that cannot be had."""
-    if model is None:
+    if optimism and reward_noise == "joint" and (model is None or model.reward_variance.any()):
+        reason = (
+            "rewards vary and count together with s' (learner.reward_noise=joint): its error is that of mean rewards"
+        )
+    elif model is None:
         reason = "the squares of the rewards overflow"
     elif (met := int(model.visits.any(1).sum())) > SMALL:
         reason = f"the stream meets {met:,} states, and more than {SMALL:,} are not solved beside a run"
     else:
         try:
-            return theta_uncertainty(model, beta, prior)
+            return theta_uncertainty(model, beta, prior, optimism=optimism)
         except InputError as error:  # streams that return nowhere
             reason = str(error)
         except (SingularChainError, np.linalg.LinAlgError):
@@ -82,7 +88,7 @@ class DataJudge:
         self._model, self._prior = model, prior
         self._parts: dict[float, tuple[Judge, np.ndarray, np.ndarray] | None] = {}
 
-    def objective(self, policy: np.ndarray, beta: float) -> float:
+    def objective(self, policy: np.ndarray, beta: float, *, optimism: float = 0.0) -> float:
         """Of a policy [S, A]; NaN where it takes actions that were never tried, or whose future no tuple tells."""
         if beta not in self._parts:
             self._parts[beta] = self._judge(beta)
@@ -93,7 +99,7 @@ class DataJudge:
         taken = policy[states]
         if (taken[~used] > 0).any():
             return np.nan
-        return judge.objective(taken, beta)
+        return judge.objective(taken, beta, optimism=optimism)
 
     def _judge(self, beta: float) -> tuple[Judge, np.ndarray, np.ndarray] | None:
         try:

@@ -43,7 +43,7 @@ from erl_torch.run.judge import (
     of_data,
 )
 from erl_torch.run.loop import Outcome, Row, SafePoint
-from erl_torch.run.report import Title, ended_as, last_rows, plural, versions
+from erl_torch.run.report import Title, at, ended_as, last_rows, plural, versions
 from erl_torch.run.verdict import verdict_of_replicas
 from erl_torch.solution import Status
 from erl_torch.solvers import solve_soft_bellman
@@ -93,7 +93,7 @@ class ReplicaRecorder:
 
     def __post_init__(self) -> None:
         learners = self.replicas.learners
-        betas = [learner.beta for learner in learners]
+        betas = [(learner.beta, learner.optimism) for learner in learners]
         self.judges = Judges(
             self.problem,
             self.settings,
@@ -113,21 +113,24 @@ class ReplicaRecorder:
         )
         for text in texts:
             note(text)
-        by_beta = {beta: self._optimum(beta) for beta in {group.beta for group in self.groups}}
-        self.optima = [by_beta[group.beta] for group in self.groups]
+        dial = [(group.beta, group.optimism) for group in self.groups]
+        found = {each: self._optimum(*each) for each in dict.fromkeys(dial)}
+        self.optima = [found[each] for each in dial]
         self.table = with_own(learners[0].quantities)
         self.recorded = Record(self.groups, self.optima, self.table)
         self.first: dict[str, np.ndarray] = {}
 
-    def _optimum(self, beta: float) -> dict[str, float]:
+    def _optimum(self, beta: float, optimism: float) -> dict[str, float]:
         """Figures of the optimum of a small known model, by quantity; none where there is none."""
         model = self.judges.model
         if model is None or not self.settings.certify or model.n_states > SMALL:
             return {}
-        optimum = solve_soft_bellman(model, beta, self.problem.prior)
+        optimum = solve_soft_bellman(model, beta, self.problem.prior, optimism=optimism)
         if optimum.status is not Status.CONVERGED or optimum.theta is None:
             return {}
         figures = {"theta": optimum.theta, "delta_max": optimum.reward_bias_max, "objective": -optimum.theta}
+        if self.judges.of_dial:
+            figures["objective_real"] = self.judges.of_model.objective(optimum.policy.numpy(), beta)
         return figures | self.judges.rewards(optimum.policy.numpy())
 
     # -- records --------------------------------------------------------------------------------------
@@ -258,6 +261,7 @@ class ReplicaRecorder:
                 {
                     "settings": {k: plain(k, v, 1) for k, v in group.settings.items()},
                     "beta": group.beta,
+                    "optimism": group.optimism,
                     "exact": optimum,
                     **row,
                 }
@@ -321,22 +325,30 @@ def _status(solution: ReplicaSolution) -> str:
 
 
 class Judges:
-    """Figures of the policies of all replicas: exact ones of the model, and episodes played at milestones."""
+    """Figures of the policies of all replicas: exact ones of the model, and episodes played at milestones.
+
+    ``dial``: (beta, optimism) of each.
+    """
 
     def __init__(
         self,
         problem: Problem,
         settings: EvaluationSettings,
-        betas: Sequence[float],
+        dial: Sequence[tuple[float, float]],
         seeds: Sequence[int],
         threads: int,
         of_data: Sequence[DataJudge | None] = (),
     ) -> None:
         self.of_data = list(of_data)
-        self.problem, self.betas, self.n_episodes, self.threads = problem, betas, settings.n_episodes, threads
+        self.problem, self.dial, self.n_episodes, self.threads = problem, dial, settings.n_episodes, threads
         self.rngs = [streams(seed).evaluation for seed in seeds]
         self.model = judging_model(problem, settings)
         self.episode = None if self.model is None else episode_model(problem)
+
+    @property
+    def of_dial(self) -> bool:
+        """Whether the real world is another than that of an objective."""
+        return any(optimism for _, optimism in self.dial)
 
     @property
     def plays(self) -> bool:
@@ -394,7 +406,10 @@ class Judges:
 
         if self.model is not None:
             figures["reward_per_step"] = each(lambda r: self.of_model.reward_per_step(policies[r]))
-            figures["objective"] = each(lambda r: self.of_model.objective(policies[r], self.betas[r]))
+            of, dial = self.of_model, self.dial
+            figures["objective"] = each(lambda r: of.objective(policies[r], dial[r][0], optimism=dial[r][1]))
+            if self.of_dial:
+                figures["objective_real"] = each(lambda r: of.objective(policies[r], dial[r][0]))
         if self.episode is not None:
             if self.episode is self.model:
                 figures["return"] = self.problem.horizon * figures["reward_per_step"]
@@ -403,25 +418,43 @@ class Judges:
             if (succeeds := self.of_success) is not None:
                 figures["success_rate"] = self.problem.horizon * each(lambda r: succeeds.reward_per_step(policies[r]))
         elif self.problem.env is None:
-            judges = self.of_data * len(policies) if len(self.of_data) == 1 else self.of_data
-            figures["objective"] = np.array(
+            figures |= self._of_counts(policies)
+        elif milestone:
+            figures |= self._played(policies)
+        return figures
+
+    def _of_counts(self, policies: np.ndarray) -> dict[str, np.ndarray]:
+        """Objectives in the models of the counts."""
+        judges = self.of_data * len(policies) if len(self.of_data) == 1 else self.of_data
+        told = list(zip(judges, policies, self.dial, strict=True))
+
+        def objectives(real: bool) -> np.ndarray:
+            return np.array(
                 [
-                    np.nan if judge is None else judge.objective(policy, beta)
-                    for judge, policy, beta in zip(judges, policies, self.betas, strict=True)
+                    np.nan if judge is None else judge.objective(policy, beta, optimism=0.0 if real else optimism)
+                    for judge, policy, (beta, optimism) in told
                 ]
             )
-        elif milestone:
-            p, env = self.problem, self.problem.env
-            played = [
-                evaluate(env, policy, beta, rng, self.n_episodes, p.horizon, p.prior, ends=p.ends)
-                for policy, beta, rng in zip(policies, self.betas, self.rngs, strict=True)
-            ]
-            figures["return"] = np.array([one.mean_return for one in played])
-            if p.ends is not None:
-                figures["success_rate"] = np.array([one.success_rate for one in played])
-            if self.model is None:
-                figures["reward_per_step"] = np.array([one.reward_per_step for one in played])
-                figures["objective"] = np.array([one.objective for one in played])
+
+        return {"objective": objectives(False)} | ({"objective_real": objectives(True)} if self.of_dial else {})
+
+    def _played(self, policies: np.ndarray) -> dict[str, np.ndarray]:
+        """Of episodes, which tell of the real world alone."""
+        p, env = self.problem, self.problem.env
+        assert env is not None
+        played = [
+            evaluate(env, policy, beta, rng, self.n_episodes, p.horizon, p.prior, ends=p.ends)
+            for policy, (beta, _), rng in zip(policies, self.dial, self.rngs, strict=True)
+        ]
+        figures = {"return": np.array([one.mean_return for one in played])}
+        if p.ends is not None:
+            figures["success_rate"] = np.array([one.success_rate for one in played])
+        if self.model is None:
+            figures["reward_per_step"] = np.array([one.reward_per_step for one in played])
+            real = np.array([one.objective for one in played])
+            figures["objective"] = np.where([optimism != 0 for _, optimism in self.dial], np.nan, real)
+            if self.of_dial:
+                figures["objective_real"] = real
         return figures
 
 
@@ -454,7 +487,8 @@ def reservations_of(
     model = None if model is None else model.restricted(prior > 0)
 
     def data_of(here: Counted, learner: StreamLearner[Any, Any]) -> Data:
-        return Data(here.tally.reward_range, of_data(here.model, learner.beta, prior) if certify else None)
+        of = learner.beta, prior, learner.optimism, learner.reward_noise
+        return Data(here.tally.reward_range, of_data(here.model, *of) if certify else None)
 
     if isinstance(experience, Simulation):  # of the model itself: it is not held against the model
         behaviour = experience.behaviour_policy
@@ -488,8 +522,9 @@ def reservations_of(
         against = (
             [] if model is None else reservations.of_model(here, model) + reservations.of_states(here.tally, model)
         )
-        found.append(reservations.of_stream(here, learner, prior) + against)
         held.append(data_of(here, learner))
+        of_it = reservations.of_stream(here, learner, prior) + reservations.of_estimate(held[-1].estimate)
+        found.append(of_it + against)
     return reservations.of_replicas(found), held
 
 
@@ -498,7 +533,8 @@ def reservations_of(
 
 def _one_group(first: str, seeds: str, names: Sequence[str], result: Mapping[str, Any]) -> Iterator[str]:
     (group,) = result["groups"]
-    yield f"{first}, beta {group['beta']:g}, {plural(result['n_replicas'], 'replica')} ({seeds}): {ended_as(result)}"
+    of = at(group["beta"], group["optimism"])
+    yield f"{first}, {of}, {plural(result['n_replicas'], 'replica')} ({seeds}): {ended_as(result)}"
     yield f"{'':18}{'mean':>12}{'quartiles':>26}{'extremes':>26}{'exact':>12}"
     for name in names:
         found = group.get(name)

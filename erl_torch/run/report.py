@@ -22,7 +22,7 @@ from erl_torch.mdp.tabular import TabularMDP
 from erl_torch.problem import Problem
 from erl_torch.run.judge import episode_model
 from erl_torch.solution import Solution, Status
-from erl_torch.solvers.policy import reward_per_step
+from erl_torch.solvers.policy import objective, reward_per_step
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ def figures(measured: Evaluation) -> dict[str, float]:
         "reward_per_step": measured.reward_per_step,
         "objective": measured.objective,
     }
-    found["success_rate"] = measured.success_rate
+    found |= {"success_rate": measured.success_rate, "objective_real": measured.objective_real}
     return {name: value for name, value in found.items() if not np.isnan(value)}
 
 
@@ -62,6 +62,8 @@ def optimal_tags(optimum: Solution | None, model: TabularMDP | None, problem: Pr
             values["rho"] = optimum.rho
         if model is not None:
             policy = optimum.policy.numpy()
+            if optimum.optimism and optimum.beta is not None:
+                values["objective_real"] = objective(model, policy, problem.prior, optimum.beta)
             values["reward_per_step"] = reward_per_step(model, policy, problem.horizon)
             if (episode := episode_model(problem)) is not None:
                 values["return"] = mean_return(episode, problem.horizon, policy)
@@ -98,6 +100,11 @@ def versions() -> dict[str, str]:
         "numpy": np.__version__,
         "gymnasium": gym.__version__,
     }
+
+
+def at(beta: float, optimism: float) -> str:
+    """``beta 10``, with the optimism where that is not 0."""
+    return f"beta {beta:g}" + (f", optimism {optimism:g}" if optimism else "")
 
 
 def headline(heading: str, result: Mapping[str, Any]) -> list[str]:

@@ -60,6 +60,7 @@ class Compare:
     seeds: int = 20
     seed: int = 0
     beta: float | None = None
+    optimism: float | None = None
     prior_policy: str | None = None
     n_sizes: int = 7
     processes: int = 1

@@ -33,6 +33,7 @@ from erl_torch.run.judge import DataJudge, EvaluationSettings, judging_model, of
 from erl_torch.run.loop import Outcome, Row
 from erl_torch.run.report import (
     Title,
+    at,
     data_tags,
     evaluation_tags,
     figures,
@@ -46,6 +47,7 @@ from erl_torch.run.report import (
 from erl_torch.run.verdict import verdict
 from erl_torch.solution import Solution, proven
 from erl_torch.solvers import certify, solve_soft_bellman
+from erl_torch.solvers.policy import objective
 
 NO_FIGURES: dict[str, float | None] = {"reward_per_step": None, "objective": None, "return": None}
 SAID = ("reward_per_step", "objective")  # at milestones
@@ -92,7 +94,7 @@ class SingleRecorder:
         if self.model is None or self.learner.needs_model:
             return None
         try:
-            return solve_soft_bellman(self.model, self.learner.beta, self.problem.prior)
+            return solve_soft_bellman(self.model, self.learner.beta, self.problem.prior, optimism=self.learner.optimism)
         except (MemoryError, RuntimeError) as error:  # what factorisations need shows as they go
             if not checks.out_of_memory(error):
                 raise
@@ -103,7 +105,8 @@ class SingleRecorder:
         """theta* with its error, as the counts of the stream alone have it; None where there is no stream."""
         if self.counts is None:
             return None
-        return of_data(self.counts.model, self.learner.beta, self.problem.prior)
+        one = self.learner
+        return of_data(self.counts.model, one.beta, self.problem.prior, one.optimism, one.reward_noise)
 
     @functools.cached_property
     def counts(self) -> reservations.Counted | None:
@@ -126,6 +129,7 @@ class SingleRecorder:
         if self.counts is None:
             return []
         noted = reservations.of_stream(self.counts, self.learner, self.problem.prior)
+        noted += reservations.of_estimate(self.estimate)
         if self.model is not None:
             bounds = None if self.optimum is None else self.optimum.theta_bounds
             model = self.model.restricted(self.problem.prior > 0)
@@ -134,19 +138,26 @@ class SingleRecorder:
         return noted
 
     def _measure(self, policy: Policy) -> Evaluation:
-        p, e = self.problem, self.settings
+        p, e, beta, optimism = self.problem, self.settings, self.learner.beta, self.learner.optimism
         exact = succeeds = None
         if p.env is None:
-            known = np.nan if self.of_data is None else self.of_data.objective(policy.numpy(), self.learner.beta)
-            return Evaluation(np.nan, np.nan, known)
+            judge, table = self.of_data, policy.detach().cpu().numpy()
+            known = np.nan if judge is None else judge.objective(table, beta, optimism=optimism)
+            real = np.nan if judge is None or not optimism else judge.objective(table, beta)
+            return Evaluation(np.nan, np.nan, known, objective_real=real)
         if p.episode is not None:
             exact = functools.partial(mean_return, p.episode, p.horizon)
             if p.success is not None:
                 succeeds = functools.partial(success_rate, p.episode, p.success, p.horizon)
         steps = e.n_episodes, p.horizon
-        return evaluate(
-            p.env, policy, self.learner.beta, self.rng, *steps, p.prior, self.model, exact, succeeds, p.ends
-        )
+        found = evaluate(p.env, policy, beta, self.rng, *steps, p.prior, self.model, exact, succeeds, p.ends)
+        if not optimism:
+            return found
+        # Episodes that are played tell of the real world alone.
+        nested = np.nan
+        if self.model is not None:
+            nested = objective(self.model, policy.detach().cpu().numpy(), p.prior, beta, optimism=optimism)
+        return found._replace(objective=nested, objective_real=found.objective)
 
     # -- records --------------------------------------------------------------------------------------
 
@@ -248,7 +259,8 @@ class SingleRecorder:
             solution = replace(solution, message=f"{type(stopped).__name__}: {stopped}")
         if self.optimum is not None:
             assert self.model is not None
-            solution = certify(solution, self.model, self.learner.beta, self.problem.prior, self.optimum)
+            given = self.model, self.learner.beta, self.problem.prior, self.optimum
+            solution = certify(solution, *given, optimism=self.learner.optimism)
         else:
             for step in (0, position):
                 board.scalars(self._optimal(solution), step)
@@ -293,6 +305,7 @@ class SingleRecorder:
             "env": self.title.env,
             "learner": self.title.learner,
             "beta": float(self.learner.beta),
+            "optimism": float(self.learner.optimism),
             "seed": self.title.seed,
             "status": solution.status.name.lower(),
             "message": solution.message,
@@ -329,7 +342,8 @@ class SingleRecorder:
             for q in QUANTITIES
             if q.digits and q.name in logged and result[q.result] is not None
         ]
-        heading = f"{self.title.env}, {self.title.learner}, beta {self.learner.beta:g}, seed {self.title.seed}"
+        of = at(self.learner.beta, self.learner.optimism)
+        heading = f"{self.title.env}, {self.title.learner}, {of}, seed {self.title.seed}"
         lines = [
             *headline(heading, result),
             f"{'':18}{'prior':>12}{'learnt':>12}",

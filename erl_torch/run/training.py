@@ -209,7 +209,7 @@ def _replicas(
         raise InputError("learner", cfg.learner.name, allowed)
     check_sizes(problem.n_states, problem.n_actions, cfg.n_replicas)
     vary = plain(cfg.vary)
-    groups = groups_of(vary, cfg.n_replicas, plain(cfg.learner), float(learner.beta))
+    groups = groups_of(vary, cfg.n_replicas, plain(cfg.learner), float(learner.beta), float(learner.optimism))
     check_sizes(problem.n_states, problem.n_actions, cfg.n_replicas * len(groups))
     learners = [_with(learner, one) for one in groups for _ in range(cfg.n_replicas)]
     for one in learners[:: cfg.n_replicas]:

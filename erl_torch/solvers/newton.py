@@ -23,7 +23,6 @@ class NewtonPattern:
     """A problem's transitions, merged over actions, on the pattern of its chains."""
 
     indptr: np.ndarray  # of the transition matrix [n*A, n]
-    log_p: np.ndarray  # of its entries
     slot: np.ndarray  # place of each of its entries in the chain's
     elimination: Elimination
 
@@ -33,18 +32,19 @@ class NewtonPattern:
         if not problem.elimination.fits:
             return None
         p = problem.transition
-        return cls(p.indptr, np.log(p.data), problem.pattern[2], problem.elimination)
+        return cls(p.indptr, problem.pattern[2], problem.elimination)
 
     def eigenvector(
-        self, log_weight: np.ndarray, ref: int, rtol: float, max_steps: int
+        self, log_weight: np.ndarray, log_q: np.ndarray, ref: int, rtol: float, max_steps: int
     ) -> tuple[np.ndarray, tuple[float, float], int] | None:
-        """(h, bounds on log rho, Newton steps) for M(s, s') = sum_a exp(log_weight(s, a)) p(s'|s, a).
+        """(h, bounds on log rho, Newton steps) for M(s, s') = sum_a exp(log_weight(s, a)) q(s'|s, a).
 
-        log_weight [n, A]; ``ref`` is a state to cut chains at. None where the iteration fails.
+        log_weight [n, A]; log_q: log q on the transitions, as CSR data; ``ref`` is a state to cut chains at. None where
+        the iteration fails.
         """
         e = self.elimination
         log_m = np.empty(e.ind.size)
-        kernels.merge_log_weights(self.indptr, self.log_p, log_weight, self.slot, e.ptr, log_m)
+        kernels.merge_log_weights(self.indptr, log_q, log_weight, self.slot, e.ptr, log_m)
         h = np.zeros(len(e.rank))
         converged, low, high, steps = kernels.newton_perron(
             e.ptr, e.ind, e.rank, *e.lu, log_m, h, ref, rtol, max_steps, POWER_STEPS, LOG_POWER_STEPS

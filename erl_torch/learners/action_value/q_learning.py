@@ -333,6 +333,7 @@ class ULearning(_Average):
     """
 
     exponential: ClassVar[bool] = True
+    assumed_optimism: ClassVar[float | None] = 1.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -47,6 +47,7 @@ class ZLearning(_Average):
     """
 
     exponential: ClassVar[bool] = True
+    assumed_optimism: ClassVar[float | None] = 1.0
     drawn_from_prior: ClassVar[str] = "a"
     states: ClassVar[tuple[type, ...]] = (ZState,)
 

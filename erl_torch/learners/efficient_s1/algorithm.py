@@ -42,6 +42,21 @@ Options, each alone (published: all off, ``unvisited="initial"``; then this *is*
                             Pairs with prior 0 take no part either way, nor do tuples that have them.
 The self-loop and the clip of rho are those of ``ListedS1`` (``self_loop="new"``, ``clip_rho``).
 
+**Optimism.** 1 optimistic (control as inference), 0 right, negative robust: with lam = ``optimism``, kappa = lam beta,
+E V gives way to C V = (1/kappa) log E exp(kappa V(s')) on the empirical rows, and what is streamed is
+
+    w = g(s,a) e y(s'),    log g = beta (r + C V - V(s) - Delta),    e = exp(kappa (V(s') - C V)) of mean 1.
+
+``sample_mean_psi`` counts for <psi^-lam> = exp(kappa C V) as for <log psi>. With it, ``mean_reward`` and
+``expected_backup``, c + e (y(s') - c) is backed up in place of e y(s'), c the least y: of the same mean over the
+visits, as that of e is known from the counts, and again without noise where y = 1. No step is then above 1/<e^2> of
+its pair, beyond which noise would grow. Otherwise e is streamed as it comes,
+and at constant steps that never goes away. The fixed point is certainty equivalence at that optimism, whose C is itself
+too small by about CV^2 / (2 kappa n), CV^2 the relative variance of exp(kappa V(s')): rows need n far above that.
+
+``reward_noise="joint"``: r and s' of a tuple count together, (1/kappa) log <exp(kappa (r + V(s')))>, as in
+``erl_torch.empirical.counts.joint``; "mean": r is the mean over the visits.
+
 Online (``online``): one pass over a stream without end, no tuple kept: tables of S*A numbers, and the counts
 n(s,a,s') that occur. The stream is cut into phases that end at S A tuples times powers of ``phase_growth``; V is fixed
 in a phase, while <V> and r are means over all visits and z, rho run as above on fresh tuples; at its end
@@ -83,7 +98,7 @@ from scipy.special import logsumexp, softmax
 
 from erl_torch import checks
 from erl_torch.checks import InputError
-from erl_torch.empirical.counts import EmpiricalMDP, EmpiricalProblem, empirical_mdp, tally
+from erl_torch.empirical.counts import NOISE, EmpiricalMDP, EmpiricalProblem, empirical_mdp, joint, tally
 from erl_torch.experience.experience import Experience, Parts, Selection
 from erl_torch.experience.transitions import Transitions
 from erl_torch.learners.efficient_s1 import kernels
@@ -100,6 +115,7 @@ SAFE_RANGE = 180.0  # of logarithms, for plain numbers: products of four such st
 DAMPING = 0.9  # step of value iteration on the counts
 SWEPT_PER_TUPLE = 8  # entries of the counts that it may read at a phase's end, for each tuple so far
 WIDE = 0.003  # width of a certificate, relative to what its policy meets, beyond which a run is no success
+LEAST_EVERY = 1024  # tuples of the online mode between looks for the least y, and at least one a state
 STATE_SWEEPS = 32  # its sweeps at most for the policy of a state that is yielded
 
 
@@ -119,13 +135,14 @@ class EfficientState:
     log_average: torch.Tensor  # the z that policy and psi are made of, [S, A]
     log_psi: torch.Tensor  # [S], line 12
     log_psi_in_use: torch.Tensor  # [S], behind the present biases
-    log_mean_psi: torch.Tensor  # log <psi>, [S, A]
-    mean_log_psi: torch.Tensor  # [S, A]
+    log_mean_psi: torch.Tensor  # log <psi^(1-optimism)>, [S, A]
+    mean_log_psi: torch.Tensor  # -beta C V, [S, A]: <log psi> at optimism 0
     empirical_width: float = math.inf  # bound on the policy's loss in the empirical model, reward a step
     psi_converged: bool = True
     certified: bool = False
     status: Status | None = None  # how a run ends that ends here; None: by the passes that are made
     message: str = ""  # what is left out, and how wide the certificate is if too wide
+    optimism: float = 0.0
 
     @property
     def rho(self) -> float:
@@ -135,8 +152,10 @@ class EfficientState:
 
     @property
     def reward_bias(self) -> torch.Tensor:
-        """delta of line 5, [S, A], reward; 0 where the stream has no visit."""
-        return ((self.log_mean_psi - self.mean_log_psi) / self.beta).clamp(min=0.0)
+        """delta of line 5, [S, A], reward, >= 0 up to optimism 1 and <= 0 from there on; 0 where there is no visit."""
+        power = 1.0 - self.optimism
+        delta = (self.log_mean_psi - power * self.mean_log_psi) / self.beta
+        return delta.clamp(min=0.0) if power > 0 else delta.clamp(max=0.0)
 
     @property
     def reward_bias_max(self) -> float:
@@ -205,6 +224,7 @@ class OnlineState(EfficientState):
     log_rho_in_use: float  # line 11; log_rho is the nearest to it within the certificate
     log_rho_max: float
     phase_end: int  # tuples
+    log_least: float = -math.inf  # of the least y, as far as it is known; above optimism 0 and below
     n_replaced: int = 0  # phases at whose end V was taken from the counts
     status: Status | None = Status.UNCERTIFIED  # CONVERGED where certified, REDUCIBLE as in CertaintyEquivalence
     message: str = "no state has been returned to yet"
@@ -232,14 +252,14 @@ class OnlineState(EfficientState):
     def part(self) -> EmpiricalProblem | None:
         """The problem of the counts; None while no state has been returned to."""
         try:
-            return self.model.problem(self.beta, self.prior_policy)
+            return self.model.problem(self.beta, self.prior_policy, optimism=self.optimism)
         except InputError as error:
             if error.key != "transitions":
                 raise
             return None
 
     def backed_up(self, part: EmpiricalProblem, value: np.ndarray) -> np.ndarray:
-        """beta (r + E V) of V [n] on the problem of the counts, less what ``part`` adds to r for unvisited actions."""
+        """beta (r + C V) of V [n] on the problem of the counts, less what ``part`` adds to r for unvisited actions."""
         missing = np.where(part.used, 0.0, self.prior_policy.numpy())[part.problem.states].sum(1)
         return np.asarray(self.beta * part.problem.action_value(value) - np.log1p(-missing)[:, None])
 
@@ -266,13 +286,17 @@ class EfficientStream:
     n_tuples: int  # of the whole stream, those that take no part included
     parts: Parts[tuple[np.ndarray, np.ndarray, np.ndarray]]  # a chunk each, int32, int32, float64:
     #   s * A + a; s', or s' * A + a'; beta r where `noisy`, else [0]
-    noisy: bool
-    log_factor_max: float  # of |beta r| where `noisy`, else 0
-    model: EmpiricalMDP
+    #   (kappa r where rewards count jointly with s')
+    noisy: bool  # each tuple's own r is in the third column
+    own_reward: bool  # ... as exp(beta r), in place of the mean reward
+    log_factor_max: float  # of the third column
+    squares: EmpiricalMDP  # ... at 2 kappa
+    model: EmpiricalMDP  # where rewards count jointly with s', their ``joint``
     part: EmpiricalProblem
     weight: torch.Tensor  # [S, A]
     inside: np.ndarray  # [S, A] bool: pairs of the problem; u = 1 elsewhere
     visited: np.ndarray  # [n_visited], pairs in the stream
+    members: np.ndarray  # states with a pair inside
     psi_rows: tuple[np.ndarray, np.ndarray, np.ndarray]  # CSR, rows of the visited pairs that sum to 1
     log_keep: np.ndarray  # [n_visited], log of what an epoch of lines 2-3 leaves of the old value; -inf: nothing
     log_rho_max: float
@@ -285,6 +309,8 @@ class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
 
     Args:
         beta: inverse temperature, 1/reward, > 0.
+        optimism: 1 optimistic (control as inference), 0 right (the paper), negative robust; any number.
+        reward_noise: "mean", or "joint": rewards that vary for the same (s,a) count together with s'.
         lr_u, lr_rho: step sizes in (0, 1]; lr_rho None is lr_u / n_states. With ``clocks``, lr_u counts for nothing
             else.
         n_epochs: passes over the stream a biasing iteration. Short ones serve best where u is carried over.
@@ -305,6 +331,7 @@ class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
     stream_bytes: ClassVar[int] = 8  # pairs
 
     beta: float = 10.0
+    optimism: float = 0.0
     lr_u: float = 0.005
     lr_rho: float | None = None
     n_epochs: int = 3
@@ -326,10 +353,12 @@ class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
     log_domain: str = "auto"
     certificate: bool = True
     unvisited: str = "exclude"
+    reward_noise: str = "mean"
 
     def __post_init__(self) -> None:
         checks.plain(self)
         checks.temperature("beta", self.beta)
+        checks.optimism("optimism", self.optimism, self.beta)
         checks.step_size("lr_u", self.lr_u)
         if self.lr_rho is not None:
             checks.step_size("lr_rho", self.lr_rho)
@@ -346,6 +375,9 @@ class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
         checks.at_least("max_psi_epochs", self.max_psi_epochs, 1)
         checks.one_of("log_domain", self.log_domain, ("auto", "on", "off"))
         checks.one_of("unvisited", self.unvisited, ("exclude", "initial"))
+        checks.one_of("reward_noise", self.reward_noise, NOISE)
+        if self.reward_noise == "joint" and not (self.sample_mean_psi and self.mean_reward):
+            raise InputError("reward_noise", "joint", "mean where sample_mean_psi or mean_reward is off")
 
     @classmethod
     def published(cls, beta: float = 10.0, **options: object) -> EfficientS1:
@@ -353,6 +385,11 @@ class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
         off: dict[str, object] = dict.fromkeys(SWITCHES, False)
         paper: dict[str, object] = {"log_domain": "off", "unvisited": "initial", "n_epochs": 15, "n_bias": 6}
         return cls(beta, **(off | paper | options))  # type: ignore[arg-type]
+
+    @property
+    def kappa(self) -> float:
+        """optimism * beta, 1/reward."""
+        return self.optimism * self.beta
 
     @property
     def averages_exp_reward(self) -> bool:
@@ -421,6 +458,7 @@ class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
             status=status,
             message=message(failure) or state.message,
             beta=self.beta,
+            optimism=self.optimism,
             history=columns(history),
         )
 
@@ -468,6 +506,7 @@ class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
             log_psi_in_use=none,
             log_mean_psi=zero,
             mean_log_psi=zero,
+            optimism=self.optimism,
         )
 
     def prepare(self, transitions: Experience, n_states: int, n_actions: int) -> EfficientStream:
@@ -475,16 +514,16 @@ class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
         data, lr_psi = transitions, 0.0 if self.sample_mean_psi else self.lr_psi
         found = tally(data, n_states, n_actions, lr_psi)
         model = empirical_mdp(data, n_states, n_actions, found)
-        part = model.problem(self.beta, self.prior_policy)
+        part = model.problem(self.beta, self.prior_policy, optimism=self.optimism)
         prior = check_prior("prior_policy", self.prior_policy, n_states, n_actions)
         weight = prior
         if self.unvisited == "exclude":
-            inside = np.asarray(part.used.any(1))
-            met = np.repeat(part.used.ravel(), np.diff(found.indptr)) & inside[found.indices]
+            taken = np.asarray(part.used.any(1))
+            met = np.repeat(part.used.ravel(), np.diff(found.indptr)) & taken[found.indices]
             if not met.all():
 
                 def takes_part(chunk: Transitions) -> np.ndarray:
-                    return np.asarray(part.used[chunk.s, chunk.a] & inside[chunk.s_next])
+                    return np.asarray(part.used[chunk.s, chunk.a] & taken[chunk.s_next])
 
                 if isinstance(data, Transitions):
                     data = data.where(takes_part(data))
@@ -492,7 +531,12 @@ class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
                     data = Selection(data, takes_part, int(found.counts[met].sum()))
                 found = tally(data, n_states, n_actions, lr_psi)
                 model = empirical_mdp(data, n_states, n_actions, found)
-            weight = prior * (part.used | ~inside[:, None])
+            weight = prior * (part.used | ~taken[:, None])
+        together = self.reward_noise == "joint" and self.optimism != 0 and found.varied
+        squares = joint(model, data, 2 * self.kappa) if together else model
+        if together:
+            model = joint(model, data, self.kappa)
+            part = replace(part, problem=model.problem(self.beta, self.prior_policy, optimism=self.optimism).problem)
         visits = model.visits.ravel()
         visited = np.flatnonzero(visits)
         indptr, indices, values = model.transition.indptr, model.transition.indices, model.transition.data
@@ -502,22 +546,29 @@ class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
             values = values / np.repeat(np.add.reduceat(values, indptr[visited]), np.diff(indptr)[visited])
             with np.errstate(divide="ignore"):
                 log_keep = visits[visited] * np.log1p(-self.lr_psi)
-        noisy = not self.mean_reward and found.varied
-        solved = self.unvisited == "exclude" and not noisy
+        own_reward = not self.mean_reward and found.varied
+        solved = self.unvisited == "exclude" and not own_reward
+        noisy = own_reward or together
+        unit = self.kappa if together else self.beta
+
+        inside = part.used if self.unvisited == "exclude" else prior > 0
 
         def columns(chunk: Transitions) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             after = chunk.s_next if self.expected_backup else chunk.s_next * np.int32(n_actions) + chunk.a_next
-            return chunk.s * np.int32(n_actions) + chunk.a, after, self.beta * chunk.r if noisy else np.zeros(1)
+            return chunk.s * np.int32(n_actions) + chunk.a, after, unit * chunk.r if noisy else np.zeros(1)
 
         return EfficientStream(
             n_tuples=len(transitions),
             parts=Parts(data, columns, self._rescale_every(n_states * n_actions)),
             noisy=noisy,
-            log_factor_max=max(abs(self.beta * r) for r in found.reward_range) if noisy else 0.0,
+            own_reward=own_reward,
+            log_factor_max=max(abs(unit * r) for r in found.reward_range) if noisy else 0.0,
+            squares=squares,
             model=model,
             part=part,
             weight=torch.from_numpy(weight),
-            inside=part.used if self.unvisited == "exclude" else prior > 0,
+            inside=inside,
+            members=np.flatnonzero(inside.any(1)),
             visited=visited,
             psi_rows=(np.append(indptr[visited], len(values)), indices, values),
             log_keep=log_keep,
@@ -587,6 +638,8 @@ class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
         Pure: ``state`` is left as it is. Raises InputError as ``online`` does.
         """
         checks.instance("chunk", chunk, Transitions, "Transitions")
+        if self.reward_noise == "joint" and self.optimism:
+            raise InputError("reward_noise", "joint", "mean in the online mode, which keeps mean rewards only")
         chunk.check_range(*state.log_z.shape)
         there = state.prior_policy.numpy() > 0
         if not there.all():
@@ -611,9 +664,16 @@ class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
         x, y = log_mean_psi.reshape(-1), mean_log_psi.reshape(-1)  # views
         log_psi = state.log_psi.numpy()
         visited, (indptr, indices, values) = stream.visited, stream.psi_rows
-        new_x, scratch, tilted = np.empty(len(visited)), np.empty(len(visited)), np.empty(len(values))
-        solvers_kernels.tilt_rows(indptr, indices, values, log_psi, new_x, scratch, tilted)
-        new_y = np.add.reduceat(values * log_psi[indices], indptr[:-1])
+        lam = self.optimism
+
+        def log_means(h: np.ndarray) -> np.ndarray:
+            """log <exp h> of the visited pairs."""
+            found, scratch, tilted = np.empty(len(visited)), np.empty(len(visited)), np.empty(len(values))
+            solvers_kernels.tilt_rows(indptr, indices, values, h, found, scratch, tilted)
+            return found
+
+        new_x = log_means((1.0 - lam) * log_psi)
+        new_y = log_means(-lam * log_psi) if lam else np.add.reduceat(values * log_psi[indices], indptr[:-1])
         # One epoch of lines 2-3 is x <- keep x + (1 - keep) new: convex, whatever the numbers.
         with np.errstate(divide="ignore", under="ignore", over="ignore"):
             keep = np.exp(stream.log_keep)
@@ -622,11 +682,13 @@ class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
             for _ in range(1 if self.sample_mean_psi else self.max_psi_epochs):
                 before_x, before_y = x[visited], y[visited]
                 x[visited] = np.logaddexp(stream.log_keep + before_x, log_fresh + new_x)
-                y[visited] = keep * before_y + (1 - keep) * new_y
-                change = np.maximum(
-                    np.abs(np.expm1(x[visited] - before_x)),
-                    np.abs(y[visited] - before_y) / (np.abs(before_y) + LOG_PSI_EPSILON),
-                )
+                if lam:  # of the logarithms of <psi^-lam>
+                    before, now = -lam * before_y, np.logaddexp(stream.log_keep - lam * before_y, log_fresh + new_y)
+                    y[visited], change = now / -lam, np.abs(np.expm1(now - before))
+                else:
+                    y[visited] = keep * before_y + (1 - keep) * new_y
+                    change = np.abs(y[visited] - before_y) / (np.abs(before_y) + LOG_PSI_EPSILON)
+                change = np.maximum(np.abs(np.expm1(x[visited] - before_x)), change)
                 if self.sample_mean_psi or change.max() < self.psi_tol:
                     converged = True
                     break
@@ -673,39 +735,66 @@ class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
 
     def _u_epoch(self, state: EfficientState, stream: EfficientStream) -> tuple[np.ndarray, np.ndarray, float]:
         """(log z, log total, log rho) after an epoch of lines 9-11."""
-        reward = 0.0 if stream.noisy else stream.model.reward
-        log_g = self.beta * (reward - state.reward_bias_max) - state.mean_log_psi.numpy()
-        log_g += state.log_psi_in_use.numpy()[:, None]
-        top = state.log_z.numpy()[stream.inside].max()
-        log_z, log_total = np.where(stream.inside, state.log_z - top, 0.0), state.log_total.numpy() - top
+        lam, log_psi, mean_log_psi = self.optimism, state.log_psi_in_use.numpy(), state.mean_log_psi.numpy()
+        reward = 0.0 if stream.own_reward else stream.model.reward
+        tilts = bool(lam) and self.sample_mean_psi and self.expected_backup and self.mean_reward
+        # Where e is streamed as it comes, the gauge psi^(1-lam) u takes it in, and z is that of it.
+        power = 1.0 if tilts else 1.0 - lam
+        gauge = (1.0 - power) * log_psi[:, None]
+        log_g = self.beta * (reward - state.reward_bias_max) - power * mean_log_psi
+        log_g += power * log_psi[:, None]
+        log_share = lam * mean_log_psi  # 1 / exp(kappa C V)
+        if stream.noisy and not stream.own_reward:
+            log_share = log_share - self.kappa * reward
+            log_g = log_g if tilts else log_g - self.kappa * reward
+        log_z = state.log_z.numpy() - gauge
+        top = log_z[stream.inside].max()
+        log_z, log_total = np.where(stream.inside, log_z - top, 0.0), state.log_total.numpy() - gauge - top
         log_g = np.where(stream.inside, log_g, 0.0)
-        span = max(np.abs(log_g).max(), stream.log_factor_max, -log_z.min(), abs(state.log_rho))
+        middle = -lam * float(log_psi[stream.members].mean())
+        log_tilt = np.where(stream.inside.any(1), -lam * log_psi - middle, 0.0)
+        log_share = np.where(stream.inside, log_share + middle, 0.0)
+        tilt = (log_tilt, log_share) if tilts else ()
+        sizes = [np.abs(x).max() for x in (log_g, *tilt)]
+        span = max(*sizes, stream.log_factor_max, -log_z.min(), abs(state.log_rho))
         with np.errstate(all="ignore"):
             if self.log_domain == "off" or (self.log_domain == "auto" and span < SAFE_RANGE):
-                tables = [np.exp(x) for x in (log_g, log_z, log_total)]
-                rho, healthy = self._stream(kernels.gauge_epoch, np.exp, state, stream, *tables)
+                g, z, total = np.exp(log_g), np.exp(log_z), np.exp(log_total)
+                rho, healthy = self._stream(np.exp, state, stream, g, z, total, tuple(map(np.exp, tilt)))
                 if healthy:
-                    return np.log(tables[1]), np.log(tables[2]), math.log(rho)
+                    return np.log(z) + gauge, np.log(total) + gauge, math.log(rho)
                 if self.log_domain == "off":
                     raise NonFiniteError(
                         state.n_tuples,
                         f"u or rho is no longer a positive finite number in biasing iteration {state.bias_iteration}, "
                         f"epoch {state.epoch + 1}, at beta={self.beta:g}: set log_domain to auto",
                     )
-            log_rho, _ = self._stream(kernels.log_gauge_epoch, np.asarray, state, stream, log_g, log_z, log_total)
-        return log_z, log_total, log_rho
+            log_rho, _ = self._stream(np.asarray, state, stream, log_g, log_z, log_total, tilt)
+        return log_z + gauge, log_total + gauge, log_rho
+
+    def _largest_steps(self, state: EfficientState, stream: EfficientStream) -> np.ndarray:
+        """1 / <e^2> of each pair, [S*A]: larger steps would let noise grow."""
+        model, h = stream.squares, -2.0 * self.optimism * state.log_psi_in_use.numpy()
+        p, found = model.transition, np.empty(state.log_z.numel())
+        solvers_kernels.tilt_rows(p.indptr, p.indices, p.data, h, found, np.empty(len(found)), np.empty(p.nnz))
+        found += 2.0 * self.optimism * state.mean_log_psi.numpy().ravel()
+        found += 2.0 * self.kappa * (model.reward - stream.model.reward).ravel()
+        return np.exp(-np.maximum(found, 0.0))
 
     def _stream(
         self,
-        kernel: Callable[..., tuple[float, bool]],
         number: Callable[[Any], Any],
         state: EfficientState,
         stream: EfficientStream,
         g: np.ndarray,
         z: np.ndarray,
         total: np.ndarray,
+        tilt: tuple[np.ndarray, ...],
     ) -> tuple[float, bool]:
-        """Run a kernel over the stream, a block at a time; ``number`` makes of a logarithm what it computes with."""
+        """Run a kernel over the stream, a block at a time; ``number`` makes of a logarithm what it computes with.
+
+        ``tilt``: of s' and of pairs, where e is backed up by its mean; else empty.
+        """
         n_states, n_actions = z.shape
         lr_rho = self.lr_u / n_states if self.lr_rho is None else self.lr_rho
         lr_rho = lr_rho / (state.epoch + 1) if self.clocks else lr_rho
@@ -713,6 +802,13 @@ class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
         rho, rho_max = number(state.log_rho), number(stream.log_rho_max)
         weight = number(state.weight.log().numpy().ravel())
         average = self.polyak and state.epoch >= self.n_epochs // 2
+        plain = number is np.exp
+        if tilt:
+            kernel = kernels.tilted_gauge_epoch if plain else kernels.log_tilted_gauge_epoch
+        else:
+            kernel = kernels.gauge_epoch if plain else kernels.log_gauge_epoch
+        of_tilt = (tilt[0], tilt[1].ravel(), self._largest_steps(state, stream), stream.members) if tilt else ()
+        which = () if tilt else (self.expected_backup,)
         t = 0
         for pair, after, log_factor in stream.parts:
             first, last, factor = t, t + len(pair), number(log_factor)
@@ -724,6 +820,7 @@ class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
                     factor,
                     stream.noisy,
                     g.ravel(),
+                    *of_tilt,
                     z.reshape(-1),
                     total.reshape(-1),
                     average,
@@ -734,7 +831,7 @@ class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
                     float(rho),
                     lr_rho,
                     float(rho_max),
-                    self.expected_backup,
+                    *which,
                     self._rescale_every(z.size),
                     t,
                     stop,
@@ -755,12 +852,16 @@ class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
         tables = {name: getattr(state, name).copy() for name in names}
         log_z = state.log_z.numpy().copy()
         lr_rho = self.lr_u / n_states if self.lr_rho is None else self.lr_rho
+        kernel = kernels.tilted_online_phase if self.optimism else kernels.online_phase
+        kappa = (self.kappa,) if self.optimism else ()
+        of_least = (state.log_least, state.n_tuples, max(LEAST_EVERY, n_states)) if self.optimism else ()
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            log_rho, log_rho_max = kernels.online_phase(
+            log_rho, log_rho_max, *log_least = kernel(
                 pair,
                 data.s_next,
                 data.r,
                 self.beta,
+                *kappa,
                 state.value,
                 *tables.values(),
                 log_z.reshape(-1),
@@ -770,6 +871,7 @@ class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
                 state.log_rho_in_use,
                 lr_rho / (state.bias_iteration + 1),
                 state.log_rho_max,
+                *of_least,
             )
         if not np.isfinite(tables["reward_squares"]).all():
             raise InputError(
@@ -785,6 +887,7 @@ class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
             log_z=torch.from_numpy(log_z),
             log_rho_in_use=log_rho,
             log_rho_max=log_rho_max,
+            log_least=log_least[0] if log_least else state.log_least,
             keys=keys,
             counts=np.bincount(entry, np.append(state.counts, np.ones(len(data)))),
             reward_sums=np.bincount(entry, np.append(state.reward_sums, data.r)),
@@ -815,18 +918,30 @@ class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
                 value[inside], n_replaced = found, n_replaced + 1
                 z = state.backed_up(part, found) - self.beta * (found[:, None] + (low + high) / 2)
                 log_z[inside] = np.where(part.used[inside], z, log_z[inside])
-        pair, s_next = np.divmod(state.keys, n_states)
         return replace(
             state,
             bias_iteration=state.bias_iteration + 1,
             phase_end=math.ceil(self.phase_growth * state.phase_end),
             n_replaced=n_replaced,
             fresh=np.zeros_like(state.fresh),
-            mean_value=np.bincount(pair, state.counts * value[s_next], visits.size) / np.maximum(state.visits, 1),
+            mean_value=self._certain(state, value),
+            log_least=-math.inf,
             log_z=torch.from_numpy(log_z),
             log_rho_in_use=log_rho,
             log_psi_in_use=torch.from_numpy(-self.beta * value),
         )
+
+    def _certain(self, state: OnlineState, value: np.ndarray) -> np.ndarray:
+        """C V of ``value`` [S] on the counts, [S*A]; 0 without visits."""
+        n_states, visits = len(value), np.maximum(state.visits, 1)
+        pair, s_next = np.divmod(state.keys, n_states)
+        if not self.optimism:
+            return np.asarray(np.bincount(pair, state.counts * value[s_next], visits.size) / visits)
+        met, first = np.unique(pair, return_index=True)
+        found = np.zeros(visits.size)
+        log_sums = np.logaddexp.reduceat(np.log(state.counts) + self.kappa * value[s_next], first)
+        found[met] = (log_sums - np.log(visits[met])) / self.kappa
+        return found
 
     def _judged(self, state: OnlineState) -> OnlineState:
         """With a policy and its certificate on the counts: that of z, or of V swept, if narrower, where z's is wide."""
@@ -868,7 +983,7 @@ class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
             weight=torch.from_numpy(weight),
             log_average=torch.from_numpy(log_average),
             log_psi=torch.from_numpy(line_12),
-            log_mean_psi=mean_log_psi,
+            log_mean_psi=(1.0 - self.optimism) * mean_log_psi,  # so that delta is 0
             mean_log_psi=mean_log_psi,
             empirical_width=high - low,
             certified=certified,
@@ -901,8 +1016,8 @@ def certificate(part: EmpiricalProblem, log_psi: np.ndarray, policy: np.ndarray)
     problem = part.problem
     value = -log_psi[problem.states] / problem.beta
     parts = (problem.transition, problem.reward, problem.prior, problem.beta)
-    low, _ = policy_gains(*parts, within(part, policy), value)
-    return float(low.min()), float(gains(*parts, value).high.max())
+    low, _ = policy_gains(*parts, within(part, policy), value, problem.kappa)
+    return float(low.min()), float(gains(*parts, value, problem.kappa).high.max())
 
 
 def is_narrow(part: EmpiricalProblem, bounds: tuple[float, float], tol: float, policy: np.ndarray) -> bool:
