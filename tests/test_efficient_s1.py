@@ -402,7 +402,7 @@ def test_step_by_step_is_iterate_and_leaves_the_state_alone():
 
 def test_pairs_never_visited_have_probability_zero_and_unseen_states_the_prior():
     keep = ~((STREAM.s == 10) & (STREAM.a == 1))
-    data = Transitions(*(getattr(STREAM, f.name)[keep] for f in fields(STREAM)))
+    data = STREAM.where(keep)
     found, limit = EfficientS1().fit(data, 16, 4), CertaintyEquivalence().fit(data, 16, 4)
     assert found.policy[10, 1] == limit.policy[10, 1] == 0
     assert (found.policy[15] == 0.25).all()
