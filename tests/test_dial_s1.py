@@ -116,6 +116,8 @@ def test_expected_lines_reach_the_exact_solution(seed, optimism):
     weight = prior * u
     assert found == pytest.approx(theta, abs=1e-12)
     np.testing.assert_allclose(weight / weight.sum(1, keepdims=True), policy, atol=1e-11)
+    C = [certainty_equivalent(p, value, beta * x) for x in (optimism, optimism - 1)]
+    np.testing.assert_allclose(delta, (1 - optimism) * (C[0] - C[1]), atol=1e-10)
     learnt = -log_psi_of[-1] / beta
     np.testing.assert_allclose(learnt - learnt[0], value - value[0], atol=1e-11)
 

@@ -39,7 +39,8 @@ class ZLearning(_Average):
     """Z-learning, for streams from the prior policy; see the module's docstring.
 
     Objective: that of U-learning, optimism 1 of the dial, where the dynamics too are at the learner's choice, at the
-    price of their KL. Optimistic in stochastic dynamics; where every action leads to one state, the package's own objective.
+    price of their KL. Optimistic in stochastic dynamics; where every action leads to one state, the package's
+    own objective.
 
     Args:
         lr_rate: step size of rho relative to that of z, in (0, 1]; None is 1 / S.
