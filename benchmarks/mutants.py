@@ -495,7 +495,7 @@ MUTANTS = [
         "learners/s1/algorithm.py",
         "found = (1 - optimism) * np.maximum(",
         "found = np.maximum(",
-        "test_dial_s1.py::test_exact_lines_reach_the_exact_solution",
+        "test_dial_s1.py::test_expected_lines_reach_the_exact_solution",
     ),
     Mutant(
         "the mean behind delta takes the exponent of line 3",

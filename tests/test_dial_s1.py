@@ -8,14 +8,15 @@ import numpy as np
 import oracle
 import pytest
 import torch
-from helpers import problems, random_mdp, random_policy, random_stream
+from helpers import composed, problems, random_mdp, random_policy, random_stream, scalars
 from hypothesis import strategies as st
 
-from erl_torch import AlgorithmS1, InputError, ListedS1, Replicas, Status, Transitions, collect
+from erl_torch import AlgorithmS1, InputError, ListedS1, Replicas, Solution, Status, Transitions, collect
 from erl_torch.empirical.counts import tally
 from erl_torch.experience.simulation import Simulation
 from erl_torch.learners.s1 import kernels
 from erl_torch.learners.s1.algorithm import gains, gauge, line_12, reward_biases
+from erl_torch.run.training import train
 
 DIAL = (3.0, 1.0, 0.5, 0.0, -0.5, -1.0, -3.0)
 IMPLEMENTATIONS = ("fast", "literal")
@@ -115,6 +116,8 @@ def test_expected_lines_reach_the_exact_solution(seed, optimism):
     weight = prior * u
     assert found == pytest.approx(theta, abs=1e-12)
     np.testing.assert_allclose(weight / weight.sum(1, keepdims=True), policy, atol=1e-11)
+    C = [certainty_equivalent(p, value, beta * x) for x in (optimism, optimism - 1)]
+    np.testing.assert_allclose(delta, (1 - optimism) * (C[0] - C[1]), atol=1e-10)
     learnt = -log_psi_of[-1] / beta
     np.testing.assert_allclose(learnt - learnt[0], value - value[0], atol=1e-11)
 
@@ -379,3 +382,55 @@ def test_goes_on_from_any_state_with_the_same_bits(optimism):
         assert last.rho == states[-1].rho
         assert torch.equal(last.u, states[-1].u)
         assert torch.equal(last.mean_log_psi, states[-1].mean_log_psi)
+
+
+# -- runs --------------------------------------------------------------------------------------------------------
+
+
+class Killed(BaseException):
+    """As SIGKILL."""
+
+
+def run_and_go_on(cfg, directory):
+    """The result of a run that was killed after its third epoch and gone on with; "whole" beside "cut"."""
+    train(cfg, directory / "whole")
+    left = [3 + (2 if cfg.n_replicas == 1 else 0)]  # safe points while tuples are collected
+
+    def safe_point():
+        left[0] -= 1
+        if not left[0]:
+            raise Killed
+
+    with pytest.raises(Killed):
+        train(cfg, directory / "cut", safe_point)
+    assert any((directory / "cut/checkpoints").iterdir())
+    result = train(cfg, directory / "cut")
+    assert scalars(directory / "cut") == scalars(directory / "whole")
+    return result
+
+
+SHORT = (
+    "experience.n_episodes=3", "evaluation.n_episodes=2", "evaluation.horizon=50", "checkpoint_every=0",
+    "evaluation.pictures=false", "learner.n_epochs=2", "learner.n_bias=3",
+)  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("learner", ["s1", "s1_listing"])
+def test_the_command_line_sweeps_optimism_and_goes_on_with_the_same_bits(tmp_path, learner):
+    values = [1.5, 1, 0.5, 0.1, 0, -0.1, -0.5]
+    cfg = composed("n_replicas=2", f"+vary.optimism={values}", f"learner={learner}", *SHORT)
+    result = run_and_go_on(cfg, tmp_path)
+    assert [group["settings"] for group in result["groups"]] == [{"optimism": value} for value in values]
+    assert [group["optimism"] for group in result["groups"]] == values
+    files = [(tmp_path / name / "replicas.npz").read_bytes() for name in ("whole", "cut")]
+    assert files[0] == files[1]
+
+
+@pytest.mark.parametrize("optimism", [1.0, -0.5])
+def test_a_single_run_goes_on_with_the_same_bits(tmp_path, optimism):
+    result = run_and_go_on(composed("learner=s1", f"learner.optimism={optimism}", *SHORT), tmp_path)
+    assert result["optimism"] == optimism
+    files = [(tmp_path / name / "solution.npz").read_bytes() for name in ("whole", "cut")]
+    assert files[0] == files[1]
+    assert Solution.load(tmp_path / "whole/solution.npz").optimism == optimism
