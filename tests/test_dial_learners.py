@@ -16,6 +16,7 @@ from erl_torch import (
     CertaintyEquivalence,
     EfficientS1,
     EvaluationSettings,
+    ListedS1,
     Replicas,
     Simulation,
     Status,
@@ -108,6 +109,20 @@ def test_the_paper_s_delta_at_any_optimism(optimism):
 
     delta = (1 - optimism) * (certain(optimism) - certain(optimism - 1))
     np.testing.assert_allclose(found.reward_bias.numpy().ravel(), delta, atol=1e-5)
+
+
+@pytest.mark.parametrize("log_domain", ["off", "on"])
+@pytest.mark.parametrize("optimism", OPTIMISM)
+def test_with_every_option_off_it_is_algorithm_s1(optimism, log_domain):
+    """Two implementations of the listing at any optimism."""
+    rng = np.random.default_rng(0)
+    data = random_stream(rng, random_mdp(rng, 4, 3), 500)
+    options = dict(beta=2.0, optimism=optimism, lr_u=0.05, lr_psi=0.1, n_epochs=2, n_bias=3)
+    paper = ListedS1(**options).fit(data, 4, 3)
+    ours = EfficientS1.published(**options, log_domain=log_domain).fit(data, 4, 3)
+    assert ours.theta == pytest.approx(paper.theta, rel=1e-12)
+    for name in ("policy", "u", "psi", "reward_bias"):
+        np.testing.assert_allclose(getattr(ours, name), getattr(paper, name), rtol=1e-10, atol=1e-14)
 
 
 @pytest.mark.parametrize(
