@@ -4,8 +4,8 @@
     python benchmarks/dial_streams.py coverage [n]       random problems, default 300 datasets
     python benchmarks/dial_streams.py page               docs/results/dial_streams.md of both
 
-Each writes its figures to docs/results/dial_streams_<what>.json, and the page anew. Loss is at most g* - J of the policy
-in the true MDP at that optimism, by its certificate, reward a step. Minutes each, on one core.
+Each writes its figures to docs/results/dial_streams_<what>.json, and the page anew. Loss is g* - J of the policy in the
+true MDP at that optimism, at most (its certificate), reward a step. Minutes each, on one core.
 """
 
 from __future__ import annotations
@@ -48,9 +48,9 @@ NOTE = """# Learners at every optimism
     python benchmarks/dial_streams.py loss
     python benchmarks/dial_streams.py coverage
 
-Windy cliff, beta 10, 500,000 tuples of the uniform prior; means over {n} streams. Loss: g* - J of the policy in the true
-MDP at that optimism, at most (its certificate), reward a step. Listed: constant steps, 15 epochs x 6. At optimism -1 the
-best policies of the cliff are all but equally good: loss says little there, and certainty equivalence may be the worse.
+Windy cliff, beta 10, 500,000 tuples of the uniform prior; means over {n} streams. Loss: g* - J of the policy in the
+true MDP at that optimism, at most (its certificate), reward a step. Listed: constant steps, 15 epochs x 6. At optimism
+-1 the cliff is nearly indifferent: its feared dynamics all but close sets of states, so that bounds say little.
 
 | optimism | theta* | loss of certainty equivalence | EfficientS1 | ratio | passes | certified | S1 as listed | ratio |
 |---|---|---|---|---|---|---|---|---|
@@ -58,8 +58,8 @@ best policies of the cliff are all but equally good: loss says little there, and
 
 ## Intervals
 
-Random problems of 8 states and 3 actions, beta 2, 20,000 tuples each, {datasets} datasets: share of the 95% intervals of
-theta that hold theta*, and error in standard errors.
+Random problems of 8 states and 3 actions, beta 2, 20,000 tuples each, {datasets} datasets: share of the 95%
+intervals of theta that hold theta*, and error in standard errors.
 
 | optimism | coverage | withheld | error, mean | error, deviation |
 |---|---|---|---|---|
@@ -156,7 +156,7 @@ def page() -> None:
 if __name__ == "__main__":
     what, *given = sys.argv[1:]
     if what == "loss":
-        loss(*map(int, given) or (20,)) if given else loss(20)
+        loss(int(given[0]) if given else 20)
     elif what == "coverage":
-        coverage(*map(int, given)) if given else coverage(300)
+        coverage(int(given[0]) if given else 300)
     page()

@@ -129,7 +129,7 @@ def test_with_every_option_off_it_is_algorithm_s1(optimism, log_domain):
     "options",
     [
         dict(expected_backup=False),
-        dict(sample_mean_psi=False),
+        dict(sample_mean_psi=False, lr_psi=0.002),
         dict(mean_reward=False),
         dict(log_domain="on"),
         dict(unvisited="initial"),
