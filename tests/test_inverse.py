@@ -7,6 +7,7 @@ import pytest
 import scipy.sparse as sp
 import torch
 from helpers import ROOT, maze
+from mpmath import mp
 from oracle import stationary
 
 from erl_torch import (
@@ -148,6 +149,58 @@ def test_rows_stand_for_the_rows_divided_by_their_sums(optimism):
     (theta + value[0] + log_policy[1, 2]).backward()
     assert (p * p.grad).sum(2).detach().numpy() == pytest.approx(np.zeros((4, 3)), abs=1e-12)
     assert (prior * prior.grad).sum(1).detach().numpy() == pytest.approx(np.zeros(4), abs=1e-12)
+
+
+def many_digits_log_policy(p, r, optimism, v):
+    """log pi*(0|0) by Newton steps in 50 digits, beta 1 and the uniform prior, from a value ``v`` that is near."""
+    n, n_actions, kappa = len(r), len(r[0]), mp.mpf(optimism)
+    pairs = [(s, a) for s in range(n) for a in range(n_actions)]
+    for _ in range(30):
+        mean = {(s, a): sum(p[s][a][t] * mp.exp(kappa * v[t]) for t in range(n)) for s, a in pairs}
+        certain = {
+            (s, a): mp.log(mean[s, a]) / kappa if kappa else sum(p[s][a][t] * v[t] for t in range(n)) for s, a in pairs
+        }
+        q = {(s, a): r[s][a] + certain[s, a] for s, a in pairs}
+        backed_up = [mp.log(sum(mp.exp(q[s, a]) for a in range(n_actions)) / n_actions) for s in range(n)]
+        system, right = mp.zeros(n + 1, n + 1), mp.zeros(n + 1, 1)
+        for s, a in pairs:
+            chosen = mp.exp(q[s, a] - backed_up[s]) / n_actions
+            for t in range(n):
+                system[s, t] -= chosen * p[s][a][t] * mp.exp(kappa * v[t]) / mean[s, a]
+        for s in range(n):
+            system[s, s] += 1
+            system[s, n], right[s] = 1, backed_up[s] - v[s]
+        system[n, 0] = 1
+        step = mp.lu_solve(system, right)
+        if max(abs(step[s]) for s in range(n)) < mp.mpf(10) ** -35:
+            break
+        v = [v[s] + step[s] for s in range(n)]
+    return mp.log(mp.exp(q[0, 0] - backed_up[0]) / n_actions)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("optimism", [0.0, 1.0, -1.0])
+def test_gradients_of_nearly_closed_chains_against_many_digits(optimism):
+    """Two pairs of states that are left with chance 1e-6."""
+    rng, p = np.random.default_rng(0), np.zeros((4, 2, 4))
+    for s in range(4):
+        for a in range(2):
+            own, other = ([0, 1], [2, 3]) if s < 2 else ([2, 3], [0, 1])
+            p[s, a, own], p[s, a, other] = rng.dirichlet([1, 1]) * (1 - 1e-6), 5e-7
+    reward, values = tensors(rng.normal(size=(4, 2)), p)
+    _, value, log_policy = soft_bellman(reward, values, beta=1.0, optimism=optimism)
+    log_policy[0, 0].backward()
+    with mp.workdps(50):
+        rows = [[[mp.mpf(x) / sum(map(mp.mpf, row)) for x in row] for row in rows] for rows in p.tolist()]
+        near, h, found = [mp.mpf(x) for x in value.tolist()], mp.mpf(10) ** -15, np.zeros((4, 2))
+        for s, a in np.ndindex(4, 2):
+            ends = []
+            for sign in (1, -1):
+                moved = [[mp.mpf(x) for x in row] for row in reward.tolist()]
+                moved[s][a] += sign * h
+                ends.append(many_digits_log_policy(rows, moved, optimism, near))
+            found[s, a] = float((ends[0] - ends[1]) / (2 * h))
+    assert reward.grad.numpy() == pytest.approx(found, abs=1e-8 * np.abs(found).max())
 
 
 def test_gradient_of_theta_is_the_share_of_time_and_needs_no_equation(monkeypatch):
@@ -441,8 +494,27 @@ def test_penalty_keeps_weights_small():
     fits = [fit_reward(expert, mdp=mdp, beta=2.0, exact=True, penalty=x) for x in (1e-2, 1e-4)]
     assert all(fit.converged for fit in fits)
     assert np.abs(fits[0].weights).max() < np.abs(fits[1].weights).max() < 100
+    assert "weights grow without end" not in fits[1].message
     unbounded = fit_reward(expert, mdp=mdp, beta=2.0, exact=True)
-    assert unbounded.converged or "may grow without end" in unbounded.message
+    assert unbounded.converged or "weights grow without end" in unbounded.message
+
+
+def test_a_feature_that_tells_nothing_has_an_infinite_error():
+    mdp, features, w, policy = linear_problem(11)
+    more = np.concatenate([features, np.ones((6, 3, 1)), np.zeros((6, 3, 1))], axis=2)
+    fit = fit_reward(1e4 * policy(w), more, mdp=mdp, beta=2.0)
+    assert fit.identified.tolist() == [True, True, True, False, False]
+    assert np.isinf(fit.standard_error[3:]).all()
+    assert fit.standard_error[:3] == pytest.approx(
+        fit_reward(1e4 * policy(w), features, mdp=mdp, beta=2.0).standard_error, rel=1e-6
+    )
+    assert fit.unmet == (4,)
+
+
+def test_a_policy_that_is_taken_for_counts_is_noted():
+    mdp, features, w, policy = linear_problem(12)
+    with pytest.warns(Note, match="exact=True"):
+        fit_reward(policy(w), features, mdp=mdp, beta=2.0)
 
 
 @pytest.mark.parametrize(

@@ -56,7 +56,7 @@ class RewardFit:
 
     weights: np.ndarray  # [F], reward; no part in ``unidentified``
     reward: np.ndarray  # [S, A], sum_k w_k phi_k; of a table 0 in pairs that take no part
-    standard_error: np.ndarray | None  # of ``weights``, [F]; None where the policy was exact
+    standard_error: np.ndarray | None  # of the told part of ``weights``, [F]; infinite without, None where exact
     identified: np.ndarray  # [F] bool: whether the weight itself is, not only a combination of it with others
     unidentified: np.ndarray  # [F, k], orthonormal columns: w plus any of them explains the behaviour as well
     eigenvalues: np.ndarray  # of the information of one step about the other directions, ascending, 1/reward^2
@@ -362,7 +362,8 @@ def _information(objective: _Objective, at: Linearised, told: np.ndarray) -> tup
     variance = np.einsum("fi,ij,fj->f", spread, axes.T @ _squares(at, advantages, reach) @ axes, spread)
     error = np.sqrt(np.maximum(variance, 0.0))
     lost = np.sqrt(((told @ axes[:, ~known]) ** 2).sum(1)) > PART
-    return sizes, np.where(lost, np.inf, error)
+    untold = np.sqrt((told**2).sum(1)) < PART
+    return sizes, np.where(lost | untold, np.inf, error)
 
 
 def _divergence(policy: np.ndarray, at: Linearised) -> np.ndarray:
@@ -379,7 +380,7 @@ def _message(
     """What to know of the fit, in one line; "" where there is nothing."""
     parts = [given.message] if given.message else []
     if not converged:
-        parts.append("the maximum was not reached: weights may grow without end (a penalty keeps them)")
+        parts.append("the maximum was not reached; where weights grow without end, a penalty keeps them")
     if hidden.shape[1]:
         parts.append(f"{hidden.shape[1]} of {len(hidden)} directions of the weights change no behaviour")
     if unmet:
