@@ -70,10 +70,9 @@ def test_function_solves_the_equation(optimism):
     assert log_policy.exp().sum(1).detach().numpy() == pytest.approx(np.ones(4), abs=1e-13)
 
 
-@pytest.mark.parametrize("reference", [None, 2])
-@pytest.mark.parametrize("optimism", OPTIMISM)
+@pytest.mark.parametrize(("optimism", "reference"), [*((x, None) for x in OPTIMISM), (0.5, 1)])
 def test_gradients_of_dense_problems(optimism, reference):
-    r, p, prior = random_problem(2)
+    r, p, prior = random_problem(2, 3, 2)
     inputs = *tensors(r, p, prior), torch.tensor(2.0, dtype=torch.float64, requires_grad=True)
 
     def solve(r, p, prior, beta):
@@ -103,7 +102,7 @@ def test_gradients_of_sparse_problems_with_missing_actions(optimism):
         return theta, value, log_policy[torch.from_numpy(kept)]
 
     inputs = *tensors(rng.normal(size=(n, 3)), pattern.data, logits), *tensors(1.5)
-    assert torch.autograd.gradcheck(solve, inputs, atol=1e-7, rtol=1e-5)
+    assert torch.autograd.gradcheck(solve, inputs, atol=1e-7, rtol=1e-5, fast_mode=True)  # along random directions
     theta, value, log_policy = soft_bellman(inputs[0], inputs[1], torch.where(torch.from_numpy(kept), 0.5, 0.0).div(
         torch.from_numpy(kept.sum(1, keepdims=True) * 0.5)), 1.5, pattern, optimism=optimism)  # fmt: skip
     assert (log_policy[~torch.from_numpy(kept)] == -torch.inf).all()
@@ -236,7 +235,7 @@ def test_rewards_are_designed_by_gradients():
     rng = np.random.default_rng(7)
     p = torch.from_numpy(rng.dirichlet(np.ones(3), size=(3, 2)))
     reward = torch.zeros(3, 2, dtype=torch.float64, requires_grad=True)
-    optimiser = torch.optim.LBFGS([reward], max_iter=100, line_search_fn="strong_wolfe", tolerance_change=0)
+    optimiser = torch.optim.LBFGS([reward], max_iter=40, line_search_fn="strong_wolfe", tolerance_change=0)
 
     def share(policy):
         chain = torch.einsum("sa,sat->st", policy, p)
@@ -391,17 +390,17 @@ def test_information_is_the_second_derivative():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("episodes", "length"), [(1, 2000), (500, 4)])
+@pytest.mark.parametrize(("episodes", "length"), [(1, 1000), (250, 4)])
 def test_errors_are_those_that_are_said_also_where_demonstrations_restart(episodes, length):
     mdp, features, w, policy = linear_problem(3)
     found, said = [], []
-    for seed in range(60):
+    for seed in range(40):
         fit = fit_reward(collect(mdp, episodes, length, seed, policy(w)), features, mdp=mdp, beta=2.0)
         found.append(fit.weights - w)
         said.append(fit.standard_error)
     z = np.array(found) / np.array(said)
-    assert np.abs(z.mean(0)).max() < 4 / np.sqrt(60)  # no bias
-    assert z.std(0) == pytest.approx(np.ones(3), abs=4 / np.sqrt(120))
+    assert np.abs(z.mean(0)).max() < 4 / np.sqrt(40)  # no bias
+    assert z.std(0) == pytest.approx(np.ones(3), abs=4 / np.sqrt(80))
 
 
 def test_a_table_tells_all_but_shaping():
