@@ -26,7 +26,7 @@ from erl_torch.experience.formats.encoding import Encoding, Met
 from erl_torch.experience.formats.format import Options
 from erl_torch.experience.formats.order import in_order, stride_of
 from erl_torch.experience.formats.roles import Roles, roles_of
-from erl_torch.experience.formats.rows import Rows, Seen, terminations
+from erl_torch.experience.formats.rows import TERMINATED, Rows, Seen, limit_of, note_of_cuts, terminations
 from erl_torch.experience.formats.table import Cells, InOrder, Table, is_frame, of_frame, of_npz, open_table
 from erl_torch.experience.recording import CHUNK, READ, FileRecording, Recordable
 from erl_torch.experience.transitions import COLUMNS, Transitions
@@ -57,6 +57,7 @@ class LogReport:
     first_bad: str
     last: int  # last rows of episodes, left out: no state after
     before_gaps: int  # rows left out: the next row is missing
+    at_limit: int  # rows left out that terminate at a time limit, where all other episodes are cut
     gaps: int | None  # rows that do not go on where the row before led to; None where that cannot be seen
     states: int
     actions: int
@@ -87,6 +88,7 @@ class LogReport:
         lines = [("log", f"{self.path}: {_n(self.rows, 'row')}; {used}")]
         out = [
             *([f"{_n(self.last, 'last row')} of an episode, without a state after"] if self.last else []),
+            *([f"{_n(self.at_limit, 'end')} at the time limit, as all others are cut there"] if self.at_limit else []),
             *([f"{_n(self.before_gaps, 'row')} before a gap"] if self.before_gaps else []),
             *([f"{_n(self.bad, 'bad row')} (the first is {self.first_bad})"] if self.bad else []),
         ]
@@ -203,18 +205,21 @@ def read_log(
     states, actions = _encodings(source, roles, strict, told)
     sizes = states.n, actions.n
     checks.memory("n_states * n_actions", f"{sizes[0]} * {sizes[1]}", 40 * sizes[0] * sizes[1], "the counts of pairs")
-    counts = _Counts(*sizes)
     reader = Rows(source, roles, states, actions, stride=stride)
-    for batch in reader.batches(READ, strict):
-        counts.add(batch)
-        told(reader.seen.rows)
+    counts = _counted(reader, sizes, strict, told)
+    finals = reader.seen.finals
+    limit = limit_of(finals).place
+    if limit is not None and (limit, TERMINATED) in finals:
+        reader.limit = limit
+        counts = _counted(reader, sizes, strict, told)
+    note_of_cuts(reader.seen)
     if not counts.visits.any():
         raise InputError(f"path={source.path}", "0 good tuples", "at least one tuple")
     prior = prior_of(counts.visits, unseen_actions)
     if prior_policy is not None:
         prior = check_policy("prior_policy", prior_policy, *sizes)
     ends = _end_rule(end_reward, failures, reader.seen)
-    known = Rows(source, roles, states, actions, prior, on_prior, seed, stride, ends)
+    known = Rows(source, roles, states, actions, prior, on_prior, seed, stride, ends, limit)
     recording = FileRecording(
         source.path, *sizes, on_bad=on_bad, chunk=chunk, report=told, format=_Prepared(known), seed=seed
     )
@@ -238,7 +243,11 @@ def _end_rule(end_reward: float, failures: str, seen: Seen) -> EndRule | None:
     some = seen.worst_end < rule.limit if end_reward < 0 else seen.best_end >= rule.limit
     if not seen.terminated or not some:
         kind = "failure" if end_reward < 0 else "success"
-        which = "no row terminates an episode" if not seen.terminated else f"no end is a {kind} by failures={failures}"
+        which = f"no end is a {kind} by failures={failures}"
+        if not seen.terminated:
+            which = "no row terminates an episode"
+        elif seen.best_end == -np.inf and seen.at_limit:
+            which = "all ends are at the time limit, where nothing is known of the rows that are cut without s_next"
         raise InputError("end_reward", end_reward, f"0: {which}")
     return EndRule(rule, end_reward)
 
@@ -348,6 +357,15 @@ class _Counts:
         self.entered[batch["s_next"]] = True
 
 
+def _counted(reader: Rows, sizes: tuple[int, int], strict: bool, told: Callable[[int], object]) -> _Counts:
+    """What all tuples have of each pair."""
+    counts = _Counts(*sizes)
+    for batch in reader.batches(READ, strict):
+        counts.add(batch)
+        told(reader.seen.rows)
+    return counts
+
+
 def _report(
     source: Table,
     roles: Roles,
@@ -391,6 +409,7 @@ def _report(
         first_bad=seen.first_bad,
         last=seen.last,
         before_gaps=seen.before_gaps,
+        at_limit=seen.at_limit,
         gaps=gaps,
         states=states.n,
         actions=actions.n,
