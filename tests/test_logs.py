@@ -863,16 +863,22 @@ b,stay,0,1
 
 
 @pytest.mark.parametrize(
-    ("end_reward", "failures", "expected"),
+    ("end_reward", "failures", "expected", "said"),
     [
-        (-3, "default", [0, -4, 0, 2, 0.5, 0, -3]),  # ends that pay at most 0, as one pays 2
-        (-3, "all", [0, -4, 0, -1, 0.5, 0, -3]),
-        (5, "default", [0, -1, 0, 7, 0.5, 0, 0]),
-        (5, "none", [0, 4, 0, 7, 0.5, 0, 5]),
-        (0, "default", [0, -1, 0, 2, 0.5, 0, 0]),
+        # ends that pay at most 0, as one pays 2
+        (
+            -3,
+            "default",
+            [0, -4, 0, 2, 0.5, 0, -3],
+            "-3 at the ends that pay at most 0, 2 of 3; env.failures says which",
+        ),
+        (-3, "all", [0, -4, 0, -1, 0.5, 0, -3], "-3 at every end, 3 of 3"),
+        (5, "default", [0, -1, 0, 7, 0.5, 0, 0], "+5 at all but the ends that pay at most 0, 1 of 3; env.failures"),
+        (5, "none", [0, 4, 0, 7, 0.5, 0, 5], "+5 at every end, 3 of 3"),
+        (0, "default", [0, -1, 0, 2, 0.5, 0, 0], ""),
     ],
 )
-def test_ends_of_a_log_count(tmp_path, end_reward, failures, expected):
+def test_ends_of_a_log_count(tmp_path, capsys, end_reward, failures, expected, said):
     path = tmp_path / "log.csv"
     path.write_text(ENDS)
     log = read_log(path, end_reward=end_reward, failures=failures)
@@ -882,7 +888,21 @@ def test_ends_of_a_log_count(tmp_path, end_reward, failures, expected):
         "experience=recorded", f"experience.path={path}", f"env.end_reward={end_reward}", f"env.failures={failures}",
         "learner=certainty_equivalence", "evaluation.pictures=false",
     )  # fmt: skip
-    assert train(cfg, tmp_path / "run")["n_experience"] == 7
+    result = train(cfg, tmp_path / "run")
+    assert result["n_experience"] == 7
+    assert (result["end_reward"] or "").startswith(said)
+    assert capsys.readouterr().out.count(f"end reward        {said}") == 2 * bool(said)  # in the report, and at the end
+
+
+def test_breakdowns_of_any_cost_are_charged():
+    """Where ends pay less than other steps do, that which pays most is no success."""
+    frame = dict(s=list("ababab"), a=[0, 0, 0, 1, 0, 0], r=[-1.0, -7, -1, -10, -1, -7], terminated=[0, 1, 0, 1, 0, 1])
+    log = read_log(frame, end_reward=-20)
+    assert log.experience.r.tolist() == [-1, -27, -1, -30, -1, -27]
+    assert "end reward        -20 at every end, 3 of 3" in str(log.report)
+    unlike = read_log(frame | {"r": [-7.0, -7, -7, -10, -7, -7]}, end_reward=-20)
+    assert unlike.experience.r.tolist() == [-7, -7, -7, -30, -7, -7]
+    assert "-20 at the ends that pay less than -7, 1 of 3; env.failures says which" in str(unlike.report)
 
 
 @pytest.mark.parametrize(

@@ -26,12 +26,12 @@ from erl_torch.experience.formats.encoding import Encoding, Met
 from erl_torch.experience.formats.format import Options
 from erl_torch.experience.formats.order import in_order, stride_of
 from erl_torch.experience.formats.roles import Roles, roles_of
-from erl_torch.experience.formats.rows import TERMINATED, Rows, Seen, limit_of, note_of_cuts, terminations
+from erl_torch.experience.formats.rows import SCALE, TERMINATED, Rows, Seen, limit_of, note_of_cuts, terminations
 from erl_torch.experience.formats.table import Cells, InOrder, Table, is_frame, of_frame, of_npz, open_table
 from erl_torch.experience.recording import CHUNK, READ, FileRecording, Recordable
 from erl_torch.experience.transitions import COLUMNS, Transitions
 from erl_torch.labels import Labels
-from erl_torch.mdp.ends import RULES, EndRule, Failures
+from erl_torch.mdp.ends import RULES, UNPAID, EndRule, Failures
 from erl_torch.mdp.tabular import check_policy, uniform
 from erl_torch.problem import Problem
 
@@ -77,7 +77,19 @@ class LogReport:
     never_left: int  # states
     never_left_labels: list[str]
     unseen_actions: str
+    end_reward: str  # what is added to the rewards of which ends; "" for nothing
+    ends_counted: int  # ends that it is added to
+    ends: int  # tuples that terminate an episode
     not_answered: list[str]
+
+    @property
+    def counted_ends(self) -> str:
+        """What is added to the rewards of which ends, and to how many; "" for nothing."""
+        if not self.end_reward:
+            return ""
+        some = self.ends_counted < self.ends
+        say = "; env.failures says which: default, unpaid, all or none" if some else ""
+        return f"{self.end_reward}, {self.ends_counted:,} of {self.ends:,}{say}"
 
     def content(self) -> dict[str, Any]:
         """As ``result.json`` holds it."""
@@ -110,6 +122,8 @@ class LogReport:
             ]
             lines.append(("episodes", f"{self.episodes:,}: {', '.join(ends)}"))
         low, high = self.reward_range
+        if self.end_reward:
+            lines.append(("end reward", self.counted_ends))
         vary = f"they vary for {self.varying_pairs:,} of {_n(self.pairs, 'pair')} (s,a)"
         lines.append(("rewards", f"{low:g} to {high:g}, mean {self.mean_reward:.6g} a tuple; {vary}"))
         rare = ""
@@ -218,7 +232,7 @@ def read_log(
     prior = prior_of(counts.visits, unseen_actions)
     if prior_policy is not None:
         prior = check_policy("prior_policy", prior_policy, *sizes)
-    ends = _end_rule(end_reward, failures, reader.seen)
+    ends = _end_rule(end_reward, failures, reader.seen, int(counts.visits.sum()))
     known = Rows(source, roles, states, actions, prior, on_prior, seed, stride, ends, limit)
     recording = FileRecording(
         source.path, *sizes, on_bad=on_bad, chunk=chunk, report=told, format=_Prepared(known), seed=seed
@@ -231,25 +245,33 @@ def read_log(
         state_labels=states.labels,
         action_labels=actions.labels,
     )
-    told_of = _report(source, roles, states, actions, counts, reader.seen, unseen_actions, bool(stride))
+    told_of = _report(source, roles, states, actions, counts, reader.seen, unseen_actions, bool(stride), ends)
     return Log(problem, recording, told_of, counts.visits)
 
 
-def _end_rule(end_reward: float, failures: str, seen: Seen) -> EndRule | None:
+def _end_rule(end_reward: float, failures: str, seen: Seen, tuples: int) -> EndRule | None:
     """What the ends count for. Raises InputError where no end gets ``end_reward``."""
     if not end_reward:
         return None
-    rule = Failures.of(failures, seen.best_end, 1)
-    some = seen.worst_end < rule.limit if end_reward < 0 else seen.best_end >= rule.limit
-    if not seen.terminated or not some:
+    others = tuples - seen.ends
+    going_on = (seen.sum_of_rewards - seen.sum_of_ends) / others / SCALE if others else -np.inf
+    rule = EndRule(Failures.of(failures, seen.best_end, 1, going_on), end_reward)
+    if not _counted_ends(rule, seen):
         kind = "failure" if end_reward < 0 else "success"
         which = f"no end is a {kind} by failures={failures}"
         if not seen.terminated:
             which = "no row terminates an episode"
-        elif seen.best_end == -np.inf and seen.at_limit:
+        elif not seen.ends and seen.at_limit:
             which = "all ends are at the time limit, where nothing is known of the rows that are cut without s_next"
         raise InputError("end_reward", end_reward, f"0: {which}")
-    return EndRule(rule, end_reward)
+    return rule
+
+
+def _counted_ends(rule: EndRule, seen: Seen) -> int:
+    """How many ends get the end reward."""
+    limit = rule.failures.limit
+    failed = {np.inf: seen.ends, -np.inf: 0, UNPAID: seen.unpaid_ends}.get(limit, seen.ends - seen.best_ends)
+    return failed if rule.end_reward < 0 else seen.ends - failed
 
 
 def prior_of(visits: np.ndarray, unseen_actions: str) -> np.ndarray:
@@ -375,6 +397,7 @@ def _report(
     seen: Seen,
     unseen_actions: str,
     counted_steps: bool,
+    rule: EndRule | None,
 ) -> LogReport:
     visits, tuples = counts.visits, int(counts.visits.sum())
     met = visits > 0
@@ -420,7 +443,7 @@ def _report(
         truncated=seen.truncated,
         cut=seen.episodes - seen.terminated - seen.truncated if ends else 0,
         reward_range=(float(counts.low.min()), float(counts.high.max())),
-        mean_reward=seen.sum_of_rewards / tuples,
+        mean_reward=seen.sum_of_rewards / tuples / SCALE,
         varying_pairs=int((counts.high > counts.low).sum()),
         pairs=int(met.sum()),
         pairs_never_seen=never_seen,
@@ -429,6 +452,9 @@ def _report(
         never_left=len(never_left),
         never_left_labels=never_left_labels,
         unseen_actions=unseen_actions,
+        end_reward="" if rule is None else str(rule),
+        ends_counted=0 if rule is None else _counted_ends(rule, seen),
+        ends=seen.ends,
         not_answered=unanswered,
     )
 

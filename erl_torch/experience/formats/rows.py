@@ -74,6 +74,7 @@ def reader_of(source: Table, options: Options) -> Rows:
 CUT, TERMINATED, KNOWN = range(3)  # last rows: without a state after; that terminate; cut, with a state after
 LEAST_CUT = 2  # episodes, of the same length, that make a time limit: one is where the log ends
 NOTED_EXCESS = 0.5  # standard errors of the number of ends
+SCALE = 2.0**-64  # of sums of rewards, so that they do not overflow
 FEW_ENDS = 2.0  # too many, which are not noted
 
 
@@ -136,11 +137,25 @@ class Seen:
     before_gaps: int = 0  # rows left out: the next row is missing
     bad: int = 0
     first_bad: str = ""
-    sum_of_rewards: float = 0.0  # of the tuples
+    sum_of_rewards: float = 0.0  # of the tuples, times SCALE
     worst_end: float = np.inf  # rewards of the steps that terminate an episode
     best_end: float = -np.inf
+    ends: int = 0  # tuples that terminate an episode
+    best_ends: int = 0  # of them, that pay as much as the best
+    unpaid_ends: int = 0  # of them, that pay at most 0
+    sum_of_ends: float = 0.0  # their rewards
     at_limit: int = 0  # rows that terminate where all others are cut, left out
     finals: Counter[tuple[int, int]] = field(default_factory=Counter)  # last rows by place in the episode and kind
+
+    def ends_pay(self, reward: np.ndarray) -> None:
+        """Of tuples that terminate an episode, [n]."""
+        self.ends += len(reward)
+        self.worst_end = min(self.worst_end, reward.min(initial=np.inf))
+        best = max(self.best_end, reward.max(initial=-np.inf))
+        self.best_ends = self.best_ends * (best == self.best_end) + int((reward == best).sum())
+        self.best_end = best
+        self.unpaid_ends += int((reward <= 0).sum())
+        self.sum_of_ends += float((reward * SCALE).sum())
 
 
 class Block(NamedTuple):
@@ -308,9 +323,7 @@ class Rows:
         seen.terminated += int(now.terminated.sum())
         at_limit = now.terminated & (now.place == (-2 if self.limit is None else self.limit))
         seen.at_limit += int((at_limit & good).sum())
-        of_ends = now.r[now.terminated & good & ~at_limit]
-        seen.worst_end = min(seen.worst_end, of_ends.min(initial=np.inf))
-        seen.best_end = max(seen.best_end, of_ends.max(initial=-np.inf))
+        paid = now.r
         if self._ends is not None:
             failed = now.terminated & self._ends.failures.among(now.r, now.s)
             counts = failed if self._ends.end_reward < 0 else now.terminated & ~failed
@@ -335,6 +348,7 @@ class Rows:
             seen.gaps += int((known & (now.s_next != then.s)).sum())
         seen.last += int((last & good).sum())
         seen.before_gaps += int((out & good & ~at_limit).sum())
+        seen.ends_pay(paid[now.terminated & good & ~at_limit & ~out])
         # What was drawn, or taken, at the end of an episode was so in another state than s'.
         a_next = np.where(now.terminated, -1, now.a_next)
         if self._on_prior:
@@ -357,7 +371,7 @@ class Rows:
         if (leave := bad | out).any():
             columns = tuple(column[~leave] for column in columns)
         s, a, r, s_next, a_next, x = columns
-        self.seen.sum_of_rewards += float(r.sum())
+        self.seen.sum_of_rewards += float((r * SCALE).sum())
         return {"s": s, "a": a, "r": r, "s_next": s_next, "a_next": self._next_actions(s_next, a_next, x)}
 
     def _next_actions(self, s_next: np.ndarray, a_next: np.ndarray, x: np.ndarray) -> np.ndarray:
