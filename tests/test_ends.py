@@ -40,6 +40,51 @@ def test_which_ends_fail_by_default():
 
 
 @pytest.mark.parametrize(
+    ("ends", "going_on", "failed"),
+    [
+        ([-7, -8, -10], [-1, -3, -4], [True, True, True]),  # a breakdown that costs a little less is no success
+        ([-7, -7], [-1, -3], [True, True]),
+        ([-1, -5], [-1, -1, -1], [False, True]),  # a goal, and a pit, where each step costs 1
+        ([-0.1, -5], [-0.1] * 30, [False, True]),  # a mean that rounds
+        ([0, -5], [-1, -1], [False, True]),
+        ([2, -5], [3, 3], [False, True]),  # what pays is a success
+        ([-1, -1], [-1, -40], [False, False]),
+    ],
+)
+def test_the_best_of_bad_ends_is_no_success(ends, going_on, failed):
+    """In a log, and in a table: one state, whose actions end or go on."""
+    reward = np.array(ends + going_on, float)
+    over = np.arange(len(reward)) < len(ends)
+    assert failing_ends(reward, over, np.zeros(len(reward), int), 1)[over].tolist() == failed
+    env = Lottery(reward, over)
+    assert model_ends(env).failed[0, over].tolist() == failed
+    if any(failed):
+        charged = EndReward(env, -1.0)
+        for a, fails in enumerate(failed):
+            charged.reset()
+            assert charged.step(a)[1] == reward[a] - fails
+
+
+class Lottery(gym.Env):
+    """One state: action a pays reward[a], and ends the episode or not."""
+
+    observation_space = gym.spaces.Discrete(1)
+    model_holds = True
+
+    def __init__(self, reward, over):
+        self.action_space = gym.spaces.Discrete(len(reward))
+        self.P = {0: {a: [(1.0, 0, float(r), bool(end))] for a, (r, end) in enumerate(zip(reward, over, strict=True))}}
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return 0, {}
+
+    def step(self, action):
+        (_, s, r, end), = self.P[0][int(action)]  # fmt: skip
+        return s, r, end, False, {}
+
+
+@pytest.mark.parametrize(
     ("rule", "best", "text"),
     [
         ("default", None, "failures=default: must be unpaid, all, none, or a list of states"),

@@ -9,8 +9,8 @@ import gymnasium as gym
 from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.envs.encoded import encoded
-from erl_torch.mdp.ends import EndRule, Failures, Rule
-from erl_torch.mdp.from_gymnasium import best_end, sizes
+from erl_torch.mdp.ends import EndRule, Rule
+from erl_torch.mdp.from_gymnasium import rule_of_ends
 
 
 class EndReward(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
@@ -32,7 +32,7 @@ class EndReward(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs
     def __init__(self, env: gym.Env[Any, Any], end_reward: float, failures: Rule = "default") -> None:
         gym.utils.RecordConstructorArgs.__init__(self, end_reward=end_reward, failures=failures)
         super().__init__(env := encoded(env))
-        rule = Failures.of(failures, best_end(env), sizes(env)[0])
+        rule = rule_of_ends(failures, env)
         self.rule = EndRule(rule, checks.finite("end_reward", end_reward))
         if end_reward < 0 and rule.limit == -float("inf") and not rule.states:
             raise InputError("end_reward", end_reward, "0, or a bonus > 0: no end is a failure by this rule")

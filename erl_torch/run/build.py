@@ -34,11 +34,12 @@ from erl_torch.mdp.ends import RULES, EndRule, Failures
 from erl_torch.mdp.from_gymnasium import (
     MeanRewardWarning,
     absorbing,
-    best_end,
+    end_pays,
     ending_states,
     has_table,
     known_mdp,
     model_ends,
+    rule_of_ends,
     sizes,
     tabular_mdp,
 )
@@ -175,12 +176,12 @@ def make_world(
             return _world_of_steps(cfg, env, failures, beta, prior)
         allowed = masks_of(env) if masking else None
         end_reward = _end_reward(cfg, env, beta, prior, allowed)
-    rule_of_ends = cfg.get("failures", "default")
+    told = cfg.get("failures", "default")
     mdp = episode = None
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", MeanRewardWarning)
         try:
-            mdp = tabular_mdp(env, on_end, allowed=allowed, end_reward=end_reward, failures=rule_of_ends)
+            mdp = tabular_mdp(env, on_end, allowed=allowed, end_reward=end_reward, failures=told)
         except InputError as error:
             if on_end == "absorb" or end_reward or masking:
                 raise error.within("env") from error
@@ -195,7 +196,7 @@ def make_world(
     rule = None if failures is None else EndRule(failures, end_reward)
     success = None
     if episode is not None:
-        chances = model_ends(env, rule_of_ends)
+        chances = model_ends(env, told)
         success = chances.ended - chances.failed
         success[absorbing(episode)] = 0.0
         success = success if success.any() else None
@@ -206,8 +207,7 @@ def _failures(cfg: DictConfig, env: gym.Env[Any, Any]) -> Failures | None:
     """The rule of ``cfg`` in ``env``; None where it is the default and the environment does not tell how it ends."""
     rule = cfg.get("failures", "default")
     rule = rule if isinstance(rule, str) else list(rule)
-    best = best_end(env)
-    return None if rule == "default" and best is None else Failures.of(rule, best, sizes(env)[0])
+    return None if rule == "default" and end_pays(env) is None else rule_of_ends(rule, env)
 
 
 def _end_reward(

@@ -43,7 +43,7 @@ from erl_torch.run.judge import (
     of_data,
 )
 from erl_torch.run.loop import Outcome, Row, SafePoint
-from erl_torch.run.report import Title, at, ended_as, last_rows, plural, versions
+from erl_torch.run.report import Title, at, end_reward, ended_as, last_rows, plural, versions
 from erl_torch.run.verdict import verdict_of_replicas
 from erl_torch.solution import Status
 from erl_torch.solvers import solve_soft_bellman
@@ -270,6 +270,7 @@ class ReplicaRecorder:
             "data_half_widths": self._half_widths(solution),
             "n_experience": longest(self.experience),
             "n_tuples": outcome.state.work,
+            "end_reward": end_reward(self.problem, self.log),
             "seconds_learning": round(outcome.seconds, 3),
             "versions": versions(),
             **({} if self.log is None else {"log": self.log.report.content()}),
