@@ -437,8 +437,8 @@ MUTANTS = [
     Mutant(
         "delta falls below 0 by rounding",
         "learners/s1/algorithm.py",
-        "return np.maximum((np.log(mean_psi) - mean_log_psi) / beta, 0.0)  # type: ignore[no-any-return]",
-        "return (np.log(mean_psi) - mean_log_psi) / beta  # type: ignore[no-any-return]",
+        "np.maximum((np.log(mean_psi) - mean_log_psi) / beta, 0.0)",
+        "((np.log(mean_psi) - mean_log_psi) / beta)",
         "test_algorithm_s1.py::test_deterministic_dynamics_need_no_bias",
     ),
     Mutant(
@@ -483,7 +483,35 @@ MUTANTS = [
         "",
         "test_algorithm_s1.py::test_fast_is_the_listing",
     ),
+    Mutant(
+        "psi is raised to the wrong power in the gauge",
+        "learners/s1/algorithm.py",
+        "exponent = (1 - optimism) * np.log(psi)",
+        "exponent = (1 + optimism) * np.log(psi)",
+        "test_dial_s1.py::test_expected_lines_reach_the_exact_solution",
+    ),
+    Mutant(
+        "delta without its factor",
+        "learners/s1/algorithm.py",
+        "found = (1 - optimism) * np.maximum(",
+        "found = np.maximum(",
+        "test_dial_s1.py::test_exact_lines_reach_the_exact_solution",
+    ),
+    Mutant(
+        "the mean behind delta takes the exponent of line 3",
+        "learners/s1/kernels.py",
+        "_mixed(x, own[0, k], decay[k], 1.0 - optimism)",
+        "_mixed(x, own[0, k], decay[k], -optimism)",
+        "test_dial_s1.py::test_the_psi_phase_is_the_sequential_one",
+    ),
     # -- replicas
+    Mutant(
+        "replicas take the first one's optimism in lines 2-3",
+        "learners/s1/lanes.py",
+        "return self.learners[r].psi_phase(",
+        "return self.learner.psi_phase(",
+        "test_dial_s1.py::test_replicas_at_any_optimism_come_out_as_alone",
+    ),
     Mutant(
         "lanes forget a psi phase cut short",
         "learners/s1/lanes.py",

@@ -1,10 +1,12 @@
 """From behaviour to reward: derivatives of the solution against differences, and rewards found again."""
 
+import re
+
 import numpy as np
 import pytest
 import scipy.sparse as sp
 import torch
-from helpers import maze
+from helpers import ROOT, maze
 from oracle import stationary
 
 from erl_torch import (
@@ -293,7 +295,7 @@ def test_weights_are_found_again(optimism):
 
 
 def test_objective_is_concave_and_is_the_likelihood_of_the_flow():
-    """l(w) = beta (<d_E, r_w> - g_w) by the test's own solver: the fit is its maximum, and it is concave along lines."""
+    """l(w) = beta (<d_E, r_w> - g_w) by the own solver here: the fit is its maximum, and it is concave along lines."""
     mdp, features, _, policy = linear_problem(1)
     rng, prior = np.random.default_rng(1), np.full((6, 3), 1 / 3)
     p, expert = mdp.transition.toarray().reshape(6, 3, 6), rng.dirichlet(np.ones(3), size=6)  # no expert of any w
@@ -469,3 +471,26 @@ def test_bad_arguments_of_the_fit(change, key):
     with pytest.raises(InputError) as error:
         fit_reward(**{"demonstrations": np.ones((6, 3)), "features": features, "mdp": mdp, "beta": 2.0} | change)
     assert error.value.key == key
+
+
+def test_feature_matching_is_inconsistent_where_walks_restart():
+    """The occupancy of episodes of 4 steps, exact: what matches its features is far from the truth; the balanced flow
+    is not."""
+    mdp, features, w, policy = linear_problem(3)
+    p, expert = mdp.transition.toarray().reshape(6, 3, 6), policy(w)
+    chain, occupancy, now = np.einsum("sa,sat->st", expert, p), np.zeros(6), mdp.start
+    for _ in range(4):
+        occupancy, now = occupancy + now / 4, now @ chain
+    shares = occupancy[:, None] * expert
+    assert fit_reward(shares, features, mdp=mdp, beta=2.0, exact=True).weights == pytest.approx(w, abs=1e-6)
+    matched = stationary(chain)[:, None] * expert
+    assert np.abs(((shares - matched)[:, :, None] * features).sum((0, 1))).max() > 0.02  # its gradient at the truth
+
+
+def test_the_page_s_example_prints_what_the_page_says(capsys):
+    page = (ROOT / "docs" / "inverse.md").read_text()
+    names = {}
+    for name in ("cliff", "function"):
+        code, output = re.search(rf"<!-- example: {name} -->\n```python\n(.*?)```\n\n```text\n(.*?)```", page, re.S).groups()
+        exec(code, names)
+        assert capsys.readouterr().out == output

@@ -14,7 +14,7 @@ As soon as that shows that the solution is near, undiscounted steps finish; wher
 T is convex from optimism 0 up, T_pi is convex there and concave below: Newton's steps are policy iteration, of the
 agent or of the dynamics, and need no care. T below 0 is neither. A step counts there where the residual falls, if need
 be the half, quarter or eighth of it; else the policy is evaluated to the end and improved (Hoffman and Karp), under
-which J never falls.
+which its value never falls.
 """
 
 from __future__ import annotations
