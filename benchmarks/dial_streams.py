@@ -150,9 +150,7 @@ def page() -> None:
         if lam != "datasets"
     ]
     n = next(iter(losses.values()))["seeds"]
-    PAGE.write_text(
-        NOTE.format(n=n, rows="\n".join(rows), datasets=covered["datasets"], coverage="\n".join(shares))
-    )
+    PAGE.write_text(NOTE.format(n=n, rows="\n".join(rows), datasets=covered["datasets"], coverage="\n".join(shares)))
 
 
 if __name__ == "__main__":

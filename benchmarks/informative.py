@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import sys
+from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
@@ -17,7 +18,7 @@ import numpy as np
 
 import erl_torch
 from erl_torch.empirical.informative import collect_informative
-from erl_torch.parallel import imap
+from erl_torch.parallel import results
 
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
 PROBLEMS = {  # environment, beta, the width that is asked for
@@ -58,7 +59,7 @@ def main() -> None:
     options = dict(word.split("=") for word in sys.argv[1:])
     seeds, processes = int(options.get("seeds", 20)), int(options.get("processes", 2))
     jobs = [(p, way, n, seed) for p in PROBLEMS for way in WAYS for n in EPISODES for seed in range(seeds)]
-    found = dict(zip(jobs, imap(width, jobs, processes), strict=True))
+    found = dict(results({job: partial(width, job) for job in jobs}, processes))
     lines, record = [], {}
     for p, (_, beta, wanted) in PROBLEMS.items():
         tuples = {}
@@ -77,8 +78,8 @@ def main() -> None:
     text = [
         "# Which sample next",
         "",
-        f"`python benchmarks/informative.py seeds={seeds}`: width of the 95% interval of theta (median over {seeds} seeds) by",
-        "the number of tuples, of the prior's behaviour and of `experience=informative`; the tuples that a width takes",
+        f"`python benchmarks/informative.py seeds={seeds}`: width of the 95% interval of theta (median over {seeds} seeds)",
+        "by the number of tuples, of the prior's behaviour and of `experience=informative`; the tuples that a width takes",
         f"({asked}); and how often the intervals hold theta*, over all sizes and seeds.",
         "",
         f"| problem | behaviour | {heads} | tuples for the width | holds theta* |",

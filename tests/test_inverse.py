@@ -491,6 +491,8 @@ def test_the_page_s_example_prints_what_the_page_says(capsys):
     page = (ROOT / "docs" / "inverse.md").read_text()
     names = {}
     for name in ("cliff", "function"):
-        code, output = re.search(rf"<!-- example: {name} -->\n```python\n(.*?)```\n\n```text\n(.*?)```", page, re.S).groups()
+        code, output = re.search(
+            rf"<!-- example: {name} -->\n```python\n(.*?)```\n\n```text\n(.*?)```", page, re.S
+        ).groups()
         exec(code, names)
         assert capsys.readouterr().out == output

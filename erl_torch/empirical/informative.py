@@ -1,7 +1,7 @@
 """Which sample next: a behaviour policy that narrows the interval of theta fastest.
 
-The variance of theta's estimate is a sum over pairs, sum_sa c(s,a)/n(s,a) with c = d*(s,a)^2 Var(x) (docs/theory.md, 4):
-``Estimate.variance * Estimate.visits``. Of n further tuples, a policy with shares of time x(s,a) leaves
+The variance of theta's estimate is a sum over pairs, sum_sa c(s,a)/n(s,a) with
+c = d*(s,a)^2 Var(x) (docs/theory.md, 4): ``Estimate.variance * Estimate.visits``. Of n further tuples, a policy with shares of time x(s,a) leaves
 
     f(x) = sum_sa c(s,a) / (n(s,a) + n x(s,a)),
 
@@ -46,7 +46,7 @@ def informative_policy(
     prior_policy: np.ndarray | None = None,
     *,
     optimism: float = 0.0,
-    explore: float = 0.1,
+    explore: float = 0.3,
 ) -> np.ndarray:
     """The behaviour policy [S, A] whose ``n_more`` tuples narrow the interval of theta most, to first order.
 
@@ -146,12 +146,12 @@ def collect_informative(
     *,
     optimism: float = 0.0,
     rounds: int = 10,
-    explore: float = 0.1,
+    explore: float = 0.3,
     report: Callable[[int], object] | None = None,
     masks: ActionMasks | None = None,
 ) -> Transitions:
-    """``collect``, where the policy that acts is the prior in the first of ``rounds`` equal parts, and then the one that
-    narrows the interval of theta most (``informative_policy``), found anew before each part.
+    """``collect``, where the prior acts in the first of ``rounds`` equal parts, and then the policy that narrows the
+    interval of theta most (``informative_policy``), found anew before each part.
 
     Args:
         source, n_episodes, episode_length, seed, prior_policy, report, masks: as of ``collect``.
@@ -219,7 +219,7 @@ class Informative(Source):
     n_episodes: int = 500
     episode_length: int = 1000
     rounds: int = 10
-    explore: float = 0.1
+    explore: float = 0.3
 
     def __post_init__(self) -> None:
         checks.optimism("optimism", self.optimism, checks.temperature("beta", self.beta))
