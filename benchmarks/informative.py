@@ -78,9 +78,9 @@ def main() -> None:
     text = [
         "# Which sample next",
         "",
-        f"`python benchmarks/informative.py seeds={seeds}`: width of the 95% interval of theta (median over {seeds} seeds)",
-        "by the number of tuples, of the prior's behaviour and of `experience=informative`; the tuples that a width takes",
-        f"({asked}); and how often the intervals hold theta*, over all sizes and seeds.",
+        f"`python benchmarks/informative.py seeds={seeds}`: width of the 95% interval of theta (median over {seeds}",
+        "seeds) by the number of tuples, of the prior's behaviour and of `experience=informative`; the tuples that a",
+        f"width takes ({asked}); and how often the intervals hold theta*, over all sizes and seeds.",
         "",
         f"| problem | behaviour | {heads} | tuples for the width | holds theta* |",
         "|---|---|" + "---|" * (len(EPISODES) + 2),

@@ -1,7 +1,8 @@
 """Which sample next: a behaviour policy that narrows the interval of theta fastest.
 
 The variance of theta's estimate is a sum over pairs, sum_sa c(s,a)/n(s,a) with
-c = d*(s,a)^2 Var(x) (docs/theory.md, 4): ``Estimate.variance * Estimate.visits``. Of n further tuples, a policy with shares of time x(s,a) leaves
+c = d*(s,a)^2 Var(x) (docs/theory.md, 4): ``Estimate.variance * Estimate.visits``. Of n further tuples, a policy with
+shares of time x(s,a) leaves
 
     f(x) = sum_sa c(s,a) / (n(s,a) + n x(s,a)),
 
@@ -37,6 +38,7 @@ STEPS = 20  # of Frank and Wolfe
 SHARPNESS = 300.0  # beta times the range of the gradient: the policy takes the best action but for e**-300 of the worst
 LEAST_GAIN = 1e-3  # of f, of a step
 BISECTIONS = 30
+SHARE: tuple[Callable[[float], bool], str] = (lambda x: 0 <= x <= 1, "a number in [0, 1]")
 
 
 def informative_policy(
@@ -63,7 +65,7 @@ def informative_policy(
         InputError: an argument out of range.
     """
     n_more = checks.at_least("n_more", n_more, 1)
-    explore = checks.number("explore", explore, lambda x: 0 <= x <= 1, "a number in [0, 1]")
+    explore = checks.number("explore", explore, *SHARE)
     prior = check_prior("prior_policy", prior_policy, model.n_states, model.n_actions)
     estimate = theta_uncertainty(model, beta, prior_policy, optimism=optimism)
     if estimate.variance is None or estimate.visits is None or not np.isfinite(estimate.variance).all():
@@ -164,6 +166,8 @@ def collect_informative(
     """
     n_episodes = checks.at_least("n_episodes", n_episodes, 1)
     rounds = min(checks.at_least("rounds", rounds, 1), n_episodes)
+    explore = checks.number("explore", explore, *SHARE)
+    checks.optimism("optimism", optimism, checks.temperature("beta", beta))
     drawn = streams(seed)
     parts: list[Transitions] = []
     done = 0
@@ -225,7 +229,7 @@ class Informative(Source):
         checks.optimism("optimism", self.optimism, checks.temperature("beta", self.beta))
         for name in ("n_episodes", "episode_length", "rounds"):
             checks.at_least(name, getattr(self, name), 1)
-        checks.number("explore", self.explore, lambda x: 0 <= x <= 1, "a number in [0, 1]")
+        checks.number("explore", self.explore, *SHARE)
 
     @property
     def n_tuples(self) -> int:

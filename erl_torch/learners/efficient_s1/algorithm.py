@@ -88,7 +88,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -331,7 +331,7 @@ class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
     stream_bytes: ClassVar[int] = 8  # pairs
 
     beta: float = 10.0
-    optimism: float = 0.0
+    optimism: float = field(default=0.0, kw_only=True)
     lr_u: float = 0.005
     lr_rho: float | None = None
     n_epochs: int = 3
