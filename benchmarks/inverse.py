@@ -241,6 +241,7 @@ def page(parts: dict[str, Any]) -> str:
         for by, seed, lost, own, took, ratio in parts["imitation"]["rows"]:
             cells = (f"{lost:.2g}", "" if own is None else f"{own:.2g}", f"{took:.2g}", f"{ratio:.3g}")
             lines.append(f"| {by} | {seed} | {' | '.join(cells)} |")
+        lines += ["", parts["imitation"].get("note", "")]
     return "\n".join(lines).rstrip() + "\n"
 
 
