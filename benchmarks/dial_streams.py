@@ -39,9 +39,9 @@ PAGE = RESULTS / "dial_streams.md"
 OPTIMISM = (1.0, 0.5, 0.0, -0.5, -1.0, -3.0)
 BETA = 10.0
 LEARNERS: dict[str, Callable[[float], Any]] = {
-    "certainty equivalence": lambda lam: CertaintyEquivalence(BETA, lam),
-    "EfficientS1": lambda lam: EfficientS1(BETA, lam),
-    "S1 as listed": lambda lam: ListedS1(BETA, lam),
+    "certainty equivalence": lambda lam: CertaintyEquivalence(BETA, optimism=lam),
+    "EfficientS1": lambda lam: EfficientS1(BETA, optimism=lam),
+    "S1 as listed": lambda lam: ListedS1(BETA, optimism=lam),
 }
 NOTE = """# Learners at every optimism
 

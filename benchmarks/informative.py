@@ -18,6 +18,7 @@ import numpy as np
 
 import erl_torch
 from erl_torch.empirical.informative import collect_informative
+from erl_torch.mdp.from_gymnasium import known_mdp
 from erl_torch.parallel import results
 
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
@@ -36,7 +37,8 @@ def width(job: tuple[str, str, int, int]) -> tuple[float, bool]:
     """(width of the 95% interval of theta, whether it holds theta*)."""
     name, way, episodes, seed = job
     env_id, beta, _ = PROBLEMS[name]
-    mdp = gym.make(env_id).unwrapped.mdp
+    mdp = known_mdp(gym.make(env_id))
+    assert mdp is not None
     if way == "prior":
         data = erl_torch.collect(mdp, episodes, LENGTH, seed)
     else:

@@ -96,7 +96,7 @@ def test_expected_lines_reach_the_exact_solution(seed, optimism):
     mdp, prior, p = small(seed)
     beta, shape = 3.0, mdp.reward.shape
     theta, policy, value = value_iteration(p, mdp.reward, prior, beta, optimism)
-    learner = AlgorithmS1(beta, optimism, prior_policy=prior)
+    learner = AlgorithmS1(beta, optimism=optimism, prior_policy=prior)
     csr = mdp.transition.indptr.astype(np.int64), mdp.transition.indices.astype(np.int32), mdp.transition.data
     psi, log_psi_of = np.ones(4), []
     for _ in range(12):
@@ -168,7 +168,9 @@ def test_expected_update_vanishes_at_the_exact_iterations(implementation, optimi
 def test_streams_come_near_the_exact_solution(optimism):
     mdp, prior, p = small(2, 3, 2)
     data = collect(mdp, 1, 100_000, 0, prior_policy=prior)
-    found = AlgorithmS1(2.0, optimism, 0.002, lr_psi=0.002, n_epochs=8, n_bias=5, prior_policy=prior).fit(data, 3, 2)
+    found = AlgorithmS1(2.0, lr_u=0.002, optimism=optimism, lr_psi=0.002, n_epochs=8, n_bias=5, prior_policy=prior).fit(
+        data, 3, 2
+    )
     theta, policy, _ = value_iteration(p, mdp.reward, prior, 2.0, optimism)
     assert found.theta == pytest.approx(theta, abs=0.02)
     np.testing.assert_allclose(found.policy, policy, atol=0.02)
@@ -269,7 +271,7 @@ def test_optimism_1_is_plain_u_learning(kind, implementation):
     """Biasing iteration 0, again and again: b = 1, delta = 0, and no psi phase (whose means of 1 are 1 to rounding)."""
     mdp, _, _ = small(3)
     data = random_stream(np.random.default_rng(0), mdp, 500)
-    learner = kind(2.0, 1.0, 0.05, n_epochs=2, n_bias=3, implementation=implementation)
+    learner = kind(2.0, lr_u=0.05, optimism=1.0, n_epochs=2, n_bias=3, implementation=implementation)
     states = list(learner.iterate(data, 4, 3))
     first = list(replace(learner, optimism=0.0, n_bias=1).iterate(data, 4, 3))
     for state, other in zip(states, first, strict=False):
@@ -286,7 +288,7 @@ def test_optimism_1_is_the_listings_two_lines_without_biases(implementation):
     mdp, _, _ = small(3)
     data = random_stream(np.random.default_rng(0), mdp, 500)
     options = dict(n_epochs=1, n_bias=1, lr_rho=0.01, implementation=implementation)
-    found = ListedS1(2.0, 1.0, 0.05, **options).fit(data, 4, 3)
+    found = ListedS1(2.0, lr_u=0.05, optimism=1.0, **options).fit(data, 4, 3)
     expected = oracle.lines_9_to_11(data, (4, 3), 2.0, 0.05, 0.01, 1.0)
     assert found.rho == pytest.approx(expected.rho, rel=1e-12)
     np.testing.assert_allclose(found.u, expected.u / expected.u.mean(), rtol=1e-12)
@@ -299,7 +301,7 @@ def test_rewards_that_vary_count_jointly_at_optimism_1():
     data = Transitions(np.zeros(n, int), np.zeros(n, int), r, np.zeros(n, int), np.zeros(n, int))
     expected = -math.log(np.exp(beta * r).mean()) / beta
     for optimism in (1.0, -1.0):
-        found = ListedS1(beta, optimism, 0.01, lr_rho=0.002, n_epochs=20, n_bias=2).fit(data, 1, 1)
+        found = ListedS1(beta, lr_u=0.01, optimism=optimism, lr_rho=0.002, n_epochs=20, n_bias=2).fit(data, 1, 1)
         assert found.theta == pytest.approx(expected, abs=0.01)
 
 
@@ -317,7 +319,9 @@ def test_bad_optimism_is_named(value):
 def test_leaving_the_numbers_is_named(implementation, optimism):
     mdp, _, _ = small(3)
     data = random_stream(np.random.default_rng(0), mdp, 2000)
-    found = AlgorithmS1(5.0, optimism, 0.1, n_epochs=1, n_bias=3, implementation=implementation).fit(data, 4, 3)
+    found = AlgorithmS1(5.0, lr_u=0.1, optimism=optimism, n_epochs=1, n_bias=3, implementation=implementation).fit(
+        data, 4, 3
+    )
     assert found.status is Status.NON_FINITE
     assert "lower beta" in found.message
     assert torch.isfinite(found.policy).all()
@@ -346,13 +350,13 @@ def test_replicas_at_any_optimism_come_out_as_alone(source, layout):
     learner = AlgorithmS1(5.0, lr_u=0.1, n_epochs=2, n_bias=3, prior_policy=prior)
     replicas = Replicas.of(learner, optimism=SWEEP, threads=2, block=3, layout=layout)
     streams = [collect(mdp, 1, 2000, seed, prior_policy=prior) for seed in range(n)]
-    experience = streams
+    experience: object = streams
     if source in ("kept", "again"):
         experience = Simulation(mdp, 1, 2000, range(n), keep=source == "kept")
     elif source != "recorded":
         noise = 0.1 * rng.standard_normal(2000) if source == "noisy" else 0.0
-        experience = replace(streams[0], r=streams[0].r + noise)
-        streams = [experience] * n
+        shared = replace(streams[0], r=streams[0].r + noise)
+        experience, streams = shared, [shared] * n
     found = replicas.fit(experience, 4, 3)
     assert list(found.failures) == [n - 1]
     assert found.optimism.tolist() == list(SWEEP)
@@ -375,7 +379,7 @@ def test_torch_operations_are_the_compiled_loop():
 def test_goes_on_from_any_state_with_the_same_bits(optimism):
     mdp, _, _ = small(4)
     data = random_stream(np.random.default_rng(1), mdp, 500)
-    learner = AlgorithmS1(3.0, optimism, 0.05, n_epochs=2, n_bias=3)
+    learner = AlgorithmS1(3.0, lr_u=0.05, optimism=optimism, n_epochs=2, n_bias=3)
     states = list(learner.iterate(data, 4, 3))
     for state in states[:-1]:
         last = list(learner.iterate(data, 4, 3, state))[-1]

@@ -253,8 +253,8 @@ def cut_log(limits, seed):
         live &= t < limits
         found.append(np.stack([np.arange(n), np.full(n, t), s, a, WAGES[s, a], ends, to])[:, live])
         live, s = live & ~ends, to
-    found = np.concatenate(found, 1)
-    columns = found[:, np.lexsort((found[1], found[0]))].T
+    joined = np.concatenate(found, 1)
+    columns = joined[:, np.lexsort((joined[1], joined[0]))].T
     frame = dict(zip(("episode", "step", "s", "a", "r", "terminated"), columns.T[:6], strict=True))
     return frame, columns.T[6]
 

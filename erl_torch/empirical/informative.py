@@ -99,7 +99,7 @@ def _design(problem: BellmanProblem, weight: np.ndarray, visits: np.ndarray, n: 
         if not top > 0:
             break
         linear = replace(problem, reward=gradient / top, beta=SHARPNESS, optimism=0.0)
-        solution = solve_problem(linear, _Sizes(*problem.reward.shape, problem), tol=1e-4)
+        solution = solve_problem(linear, _Sizes(problem), tol=1e-4)
         towards = _shares(problem, solution.policy.numpy()[problem.states]) - share
         step = _line_search(weight, visits + n * share, n * towards)
         gain = left(share) - left(share + step * towards)
@@ -113,9 +113,11 @@ def _design(problem: BellmanProblem, weight: np.ndarray, visits: np.ndarray, n: 
 class _Sizes:
     """Those that solutions of ``problem`` are spread over."""
 
-    n_inside: int
-    n_actions: int
     problem: BellmanProblem
+
+    @property
+    def n_actions(self) -> int:
+        return self.problem.n_actions
 
     @property
     def n_states(self) -> int:
