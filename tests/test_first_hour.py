@@ -413,6 +413,8 @@ def estimate(value, sd):
     [
         ([1.0] * 20, solution(1.0), estimate(1.01, 0.02), "Yes, as far as the data can tell"),
         ([1.0] * 20, solution(1.0), estimate(1.1, 0.02), "It has settled, but outside"),
+        ([1.0] * 20, solution(1.0, (0.5, 0.6)), estimate(1.01, 0.02), "but not at theta*: the data contradict"),
+        ([1.0] * 20, solution(1.0, (0.9, 0.95)), estimate(1.01, 0.02), "Yes, as far as the data can tell"),
         ([*[1.0] * 19, 1.2], solution(1.2), estimate(1.2, 0.02), "Not settled"),
         ([1.0] * 20, solution(1.0), None, "Whether at theta*, no data tell"),
         ([1.0], solution(1.0, (0.9999, 1.0001)), None, "Yes: theta is inside its proven bounds"),
