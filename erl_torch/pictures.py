@@ -57,7 +57,8 @@ def brief(labels: Sequence[str]) -> list[str]:
     """Labels on one line each, at most 24 letters long and as different as they were, that matplotlib takes for no
     formula: cut at their ends, else in their middles, else without what all begin and end with, else after numbers."""
     lines = [" ".join(label.split()) for label in labels]
-    head, tail = (len(os.path.commonprefix(x)) for x in (lines, [line[::-1] for line in lines]))
+    both = (lines, [line[::-1] for line in lines])
+    head, tail = (len(os.path.commonprefix(x)) for x in both)  # noqa: RUF071  of texts
     shortest = min(map(len, lines), default=0)
     inner = [line[head : len(line) - min(tail, shortest - head)] for line in lines]
     ways = (

@@ -158,6 +158,7 @@ def test_arguments_that_are_keys_of_every_environment_are_given_apart(typed_here
         ("env=broken:Ring", f"broken failed (AttributeError: {ABSENT}, broken.py, line 2)"),
         ("env=broken:Ring-v0", f"that can be imported: broken failed (AttributeError: {ABSENT}"),
         ("env=not_there:Ring-v0", "there is no module not_there"),
+        ("env=not_there:Ring", "env=not_there:Ring: must be"),
         ("learner.class=shop", "learner.class=shop: must be the dotted name of a class"),
     ],
 )  # fmt: skip
