@@ -17,6 +17,7 @@ __version__ = "0.1.0"
 _PUBLIC = {
     "checks": "InputError",
     "empirical.counts": "EmpiricalMDP empirical_mdp",
+    "empirical.informative": "collect_informative informative_policy",
     "empirical.uncertainty": "Estimate bootstrap_theta policy_uncertainty theta_uncertainty",
     "envs.estimate": "EstimatedModel estimate_mdp",
     "evaluation": "Evaluation evaluate",

@@ -102,7 +102,7 @@ def learning_curves(sizes: Sequence[int], curves: Mapping[str, Sequence[Mapping[
             # An interval that reaches 0 has no lower end on this axis: it is cut at a third of the lowest point.
             axes.fill_between(at, np.maximum(low, min(y) / 3), high, color=colour, alpha=0.18, linewidth=0, zorder=2)
         ends.append((y[-1], name, colour))
-    _plain(axes, "tuples of experience", "gap  g* \u2212 J,  reward a step")
+    plain(axes, "tuples of experience", "gap  g* \u2212 J,  reward a step")
     axes.set_xlim(sizes[0] / 1.15 if len(sizes) > 1 else sizes[0] / 2, sizes[-1])
     figure.text(0.095, 0.945, title, fontsize=11, weight="bold")
     figure.text(0.095, 0.908, "interquartile mean over seeds, 95 % band", fontsize=8.5, color="#666666")
@@ -150,7 +150,7 @@ def bands(
             axes.set_xscale("log")
         if not markers:
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-        _plain(axes, x_label, label)
+        plain(axes, x_label, label)
         if len(lines) > 1 and axes is all_axes[0]:
             axes.legend(fontsize=7, frameon=False)
     return pixels(figure)
@@ -175,7 +175,8 @@ def _panels(n: int, title: str, caption: str, card: bool) -> tuple[Figure, list[
     return figure, panels
 
 
-def _plain(axes: Axes, x_label: str, y_label: str) -> None:
+def plain(axes: Axes, x_label: str, y_label: str) -> None:
+    """Labels, a grid, and no frame at the top and on the right."""
     axes.grid(True, which="major", color="#dddddd", linewidth=0.8, zorder=0)
     axes.set_axisbelow(True)
     for side in ("top", "right"):

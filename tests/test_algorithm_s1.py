@@ -211,7 +211,7 @@ def test_psi_and_policy_are_equations_7_and_12(implementation, unvisited):
     mdp, prior = random_mdp(rng, 4, 3), random_policy(rng, 6, 3)
     data = random_stream(rng, mdp, 200)
     learner = AlgorithmS1(
-        3.0, 0.1, n_epochs=2, n_bias=3, prior_policy=prior, unvisited=unvisited, implementation=implementation
+        3.0, lr_u=0.1, n_epochs=2, n_bias=3, prior_policy=prior, unvisited=unvisited, implementation=implementation
     )
     for state in learner.iterate(data.where((data.s != 1) | (data.a != 2)), 6, 3):
         weight = prior * state.u.numpy()

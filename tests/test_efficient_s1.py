@@ -691,7 +691,7 @@ def test_the_certificate_holds_with_its_rounding():
 def test_a_fault_of_the_counts_is_not_taken_for_a_short_stream(monkeypatch):
     *_, state = EfficientS1().online([STREAM], 15, 4)
 
-    def refuse(*_):
+    def refuse(*_, **__):
         raise InputError("beta", 1, "another")
 
     monkeypatch.setattr("erl_torch.empirical.counts.EmpiricalMDP.problem", refuse)

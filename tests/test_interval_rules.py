@@ -32,6 +32,11 @@ def walk(*rows):
     return empirical_mdp(Transitions(s, a, r, s_next, a), int(s.max()) + 1, int(a.max()) + 1)
 
 
+def _at_rest(part):
+    """A policy whose states are worth the same."""
+    return _Worth(0.0, np.empty(0), np.zeros(part.problem.n_states))
+
+
 def divergence(p, q):
     """KL(p || q) of Bernoulli."""
     return p * np.log(p / q) + (1 - p) * np.log((1 - p) / (1 - q))
@@ -87,7 +92,7 @@ def test_rows_with_a_single_draw_may_hide_any_state():
     """0 leads to 1 nine times and to 2 once, 1 to 2, 2 to 3, 3 to 0. No state is met from most."""
     model = walk((9, 0, 0, 0.0, 1), (1, 0, 0, 0.0, 2), (10, 1, 0, 0.0, 2), (10, 2, 0, 0.0, 3), (10, 3, 0, 0.0, 0))
     part = model.problem(1.0)
-    rows = uncertainty._rows(model, part, np.zeros(4))
+    rows = uncertainty._rows(model, part, _at_rest(part))
     for worth in (np.arange(4.0), -np.arange(4.0)):
         wide, _ = _with_successor(model, part, rows, worth)
         best = int(worth.argmax())
@@ -103,7 +108,7 @@ def test_any_row_may_hide_what_is_met_from_most_states(last, hidden):
     pairs = ((0, 1), (1, 2), (1, 0), (2, 3), (2, 0), (3, last))
     model = walk(*((10, s, a, 0.0, s_next) for s, s_next in pairs for a in (0, 1)))
     part = model.problem(1.0)
-    wide, _ = _with_successor(model, part, uncertainty._rows(model, part, np.zeros(4)), -np.arange(4.0))
+    wide, _ = _with_successor(model, part, uncertainty._rows(model, part, _at_rest(part)), -np.arange(4.0))
     for row in (0, 1):  # both actions of 0
         assert set(wide.indices[wide.indptr[row] : wide.indptr[row + 1]].tolist()) == {1} | hidden
 
@@ -190,7 +195,7 @@ def test_luck_of_two_arms(monkeypatch, beta, policy):
     part = arms(spread(10, 2.0), spread(10, 3.0))
     problem = part.problem(beta)
     here = _Worth(0.0, np.array([[policy, 1 - policy]]), np.zeros(1))
-    rows = uncertainty._rows(part, problem, np.zeros(1))
+    rows = uncertainty._rows(part, problem, _at_rest(problem))
     x, weight = np.polynomial.hermite_e.hermegauss(101)
     y = beta * np.sqrt(0.5) * x
     gained = weight @ (np.logaddexp(0, y) - np.log(2)) / weight.sum() / beta
@@ -204,7 +209,7 @@ def test_luck_is_of_arms_that_may_be_as_good(beta, behind, lucky):
     """The second is behind by so many errors of the difference, 1; with beta .5 the second order has all of it."""
     model = arms(spread(10, 5.0), spread(10, 5.0) - behind)
     part, policy = model.problem(beta), np.array([[1.0, 0.0]])
-    rows = uncertainty._rows(model, part, np.zeros(1))
+    rows = uncertainty._rows(model, part, _at_rest(part))
     assert (_luck(part, _Worth(0.0, policy, np.zeros(1)), rows, policy) > 0) is lucky
 
 
@@ -215,7 +220,7 @@ def test_the_low_end_of_the_best_of_equal_arms_is_where_all_are_low(n_arms):
     beta, means = 1e6, np.append(0.0, np.full(n_arms - 1, -0.01))
     model = arms(*(spread(100) + mean for mean in means))
     part, policy = model.problem(beta), np.eye(n_arms)[:1]
-    luck = _luck(part, _Worth(0.0, policy, np.zeros(1)), uncertainty._rows(model, part, np.zeros(1)), policy)
+    luck = _luck(part, _Worth(0.0, policy, np.zeros(1)), uncertainty._rows(model, part, _at_rest(part)), policy)
     level = brentq(lambda x: 50 * (np.maximum(means - x, 0) ** 2).sum() - BUDGET, -1, 0)
     found = theta_uncertainty(model, beta)
     assert found.bias == pytest.approx(0, abs=1e-9)

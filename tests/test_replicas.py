@@ -189,7 +189,9 @@ def test_rewards_that_vary_are_cut_without_a_trace(small, monkeypatch):
 @pytest.mark.parametrize("backend", ["compiled", "torch"])
 def test_replicas_clip_rho(backend):
     data = [overshooting(r) for r in (-0.02, 0.0, 0.2)]
-    found = Replicas.of(AlgorithmS1(5.0, 0.05, 0.1, n_epochs=1, n_bias=1), 3, backend=backend).fit(data, 2, 1)
+    found = Replicas.of(AlgorithmS1(5.0, lr_u=0.05, lr_rho=0.1, n_epochs=1, n_bias=1), 3, backend=backend).fit(
+        data, 2, 1
+    )
     np.testing.assert_allclose(found.rho, [1.0, 1.0, np.exp(1.0)], rtol=1e-14)
     shared = Replicas.of(AlgorithmS1(5.0, n_epochs=1, n_bias=1), lr_u=[0.05, 0.06], lr_rho=[0.1, 0.1], backend=backend)
     np.testing.assert_allclose(shared.fit(data[2], 2, 1).rho, np.exp(1.0), rtol=1e-14)

@@ -70,6 +70,7 @@ from erl_torch.solvers.policy import kl_per_state
 from erl_torch.solvers.problem import BellmanProblem
 from erl_torch.solvers.soft_bellman import solve_problem
 
+NONE = np.empty(0)
 COUNTED_SHARE = 0.01  # of the variance, from which on a pair counts for ``smallest_visits``
 BIAS_STATES = 1000  # beyond, the second order is a mean over random signs, as the exact one takes S linear systems
 SIGNS = 100  # vectors of random signs
@@ -353,8 +354,8 @@ class _Worth(NamedTuple):
     gain: float  # J
     d: np.ndarray  # its stationary distribution over pairs, [n, A]
     value: np.ndarray  # relative, [n]
-    certain: np.ndarray  # C V, [n*A]; none at optimism 0
-    tilted: np.ndarray  # q, as the data of the transitions; none at optimism 0
+    certain: np.ndarray = NONE  # C V, [n*A]; none at optimism 0
+    tilted: np.ndarray = NONE  # q, as the data of the transitions; none at optimism 0
 
 
 def _worth(problem: BellmanProblem, policy: np.ndarray, value: np.ndarray | None = None) -> _Worth:
@@ -364,7 +365,7 @@ def _worth(problem: BellmanProblem, policy: np.ndarray, value: np.ndarray | None
     if not problem.optimism:
         lu = problem.regeneration(policy)
         gain, value = lu.poisson(reward)
-        return _Worth(gain, lu.stationary()[:, None] * policy, value, np.empty(0), np.empty(0))
+        return _Worth(gain, lu.stationary()[:, None] * policy, value)
     ref = problem.regeneration_state()
     if ref is None:
         raise SingularChainError("several closed classes")

@@ -243,7 +243,7 @@ QUANTITIES = (
         replicas=True,
         result="objective_real",
         digits=".5f",
-        row="... really",
+        row="objective, real",
     ),
     Quantity(
         "return",

@@ -225,6 +225,15 @@ def _relative_entropy(policy, prior):
 
 
 @numba.njit(cache=True, error_model="numpy", nogil=True)
+def divergence_rows(indptr, tilted, data, high):
+    """high [rows] >= KL(tilted || data) of each CSR row in exact arithmetic, nats, rows divided by their sums."""
+    for k in range(indptr.size - 1):
+        high[k] = 0.0
+        if indptr[k + 1] > indptr[k]:
+            high[k] = _relative_entropy(tilted[indptr[k] : indptr[k + 1]], data[indptr[k] : indptr[k + 1]])[1]
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
 def policy_gain_rows(indptr, indices, data, reward, prior, beta, kappa, policy, value, low, high):
     """low <= T_pi V - V <= high [S] in exact arithmetic, T_pi V = sum_a pi (r + E V - log(pi/pi0)/beta); C V for E V
     where kappa is not 0.

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 
 from erl_torch import checks
 from erl_torch.mdp.tabular import TabularMDP, check_prior
-from erl_torch.solvers import kernels
+from erl_torch.solvers import certificate_kernels, kernels
 from erl_torch.solvers.certificates import Gains, certainty_equivalent, gains
 from erl_torch.solvers.chains import Elimination, RegenerativeLU, SingularChainError, classes, reachable_from
 
@@ -170,6 +170,20 @@ class BellmanProblem:
         log_mean, kl, tilted = np.empty(n), np.empty(n), np.empty(p.nnz)
         kernels.tilt_rows(p.indptr, p.indices, p.data, h, log_mean, kl, tilted)
         return log_mean, kl, tilted
+
+    def feared(self, value: np.ndarray) -> BellmanProblem:
+        """Below optimism 0: the problem, at optimism 0, of an agent that is paid KL(q||p)/|kappa| to live in q_V.
+
+        No start has a larger g* here than there: q_V is one of the dynamics that may be feared. The pay is rounded up.
+        """
+        tilted, p, kl = self.tilted(value), self.transition, np.empty(self.reward.size)
+        assert tilted is not None
+        certificate_kernels.divergence_rows(p.indptr, tilted, p.data, kl)
+        paid = np.nextafter(kl / -self.kappa, np.inf, where=kl > 0, out=np.zeros(len(kl))).reshape(self.reward.shape)
+        reward = np.where(paid > 0, np.nextafter(self.reward + paid, np.inf), self.reward)
+        q = sp.csr_array((tilted, p.indices.copy(), p.indptr.copy()), shape=p.shape)
+        q.eliminate_zeros()
+        return replace(self, transition=q, reward=reward, optimism=0.0)
 
     def ending(self) -> BellmanProblem:
         """The problem on its one closed class, where the process ends under every policy with full support."""

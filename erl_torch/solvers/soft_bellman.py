@@ -1,8 +1,8 @@
 """The average-reward soft Bellman equation V + g = TV, g = -theta* (``problem.py``), solved by Newton's method.
 
 T is monotone, and from optimism 0 up convex; its derivative is the chain of the policy pi_V, in the dynamics q_V. So
-Newton's step is soft policy iteration: there J never falls, and the error squares near the solution. ``horizons.py``
-has the steps.
+Newton's step is soft policy iteration, at optimism 0, where J never falls, and of agent and dynamics together above.
+The error squares near the solution. ``horizons.py`` has the steps.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from erl_torch import checks
 from erl_torch.mdp.tabular import TabularMDP, check_policy, check_prior
 from erl_torch.solution import Solution
 from erl_torch.solvers.horizons import Backup, BellmanState, iterate, undiscounted
+from erl_torch.solvers.nested import objective
 from erl_torch.solvers.problem import BellmanProblem
 from erl_torch.solvers.result import Sized, ended, policy_gap, reducible_solution
 
@@ -76,7 +77,22 @@ def solve_problem(
             best = state
     assert state is not None
     assert best is not None
-    return ended(mdp, problem, best.value, (lower, upper), tol, state.step, max_steps, prior_policy)
+    bounds = lower, upper
+    if problem.kappa < 0 and not problem.is_narrow(bounds, tol, best.policy):
+        bounds = _both_sides(problem, best, bounds, tol)
+    return ended(mdp, problem, best.value, bounds, tol, state.step, max_steps, prior_policy)
+
+
+def _both_sides(
+    problem: BellmanProblem, state: BellmanState, bounds: tuple[float, float], tol: float
+) -> tuple[float, float]:
+    """``bounds`` on theta*, below optimism 0, with what the policy of ``state`` is worth in the dynamics that it fears,
+    and the best that can be had in the dynamics that ``state`` fears; from every start, as ``bounds`` are."""
+    everywhere = np.full(problem.n_states, 1 / problem.n_states)
+    parts = (problem.transition, problem.reward, problem.prior, problem.beta, state.policy, everywhere)
+    worth = objective(*parts, optimism=problem.optimism).low
+    best = polish(problem.feared(state.value), state.value, (-np.inf, np.inf), tol)[1][0]
+    return max(bounds[0], best), min(bounds[1], -worth)
 
 
 def certify(

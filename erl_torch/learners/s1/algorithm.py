@@ -26,12 +26,26 @@ One biasing iteration estimates <psi> and <log psi> from the stream (lines 2-3, 
 with r_b = r + delta - Delta for n_epochs passes (the u phase), and sets psi anew (line 12). The policy is
 pi0 u, normalised (lines 13-14). The first iteration has psi = 1, no bias: its policy is the optimistic one.
 
+``optimism`` (lam; 1 optimistic (control as inference), 0 right, negative robust) is what the agent makes of the dice of
+the dynamics. With V = -log(psi)/beta, C V = (1/kappa) log <exp(kappa V)> and kappa = lam beta (docs/theory.md, 9):
+
+    line 2     <psi^(1-lam)> in place of <psi>; ``mean_psi`` is its power 1/(1-lam), a mean of psi
+    line 3     <psi^(-lam)> in place of <log psi>; ``mean_log_psi`` is l = -log <psi^(-lam)> / lam, which is -beta C V
+    line 4     b = psi(s')^(1-lam) / <psi^(1-lam)>
+    line 5     delta = (log <psi^(1-lam)> - (1-lam) l) / beta: >= 0 for lam <= 1, <= 0 above
+
+At 0 this is the listing. At 1 b = 1 and delta = 0: each biasing iteration is plain U-learning, and there is no psi
+phase. Lines 6-14 are the listing's at every optimism, rho = exp(-beta) of line 8 with them. Only l counts in lines
+9-11; <psi^(1-lam)> cancels but for Delta, a constant.
+
 Exact rearrangements used by ``implementation="fast"`` (the literal twin is ``erl_torch.learners.s1.listing``)
 
     psi phase   psi is fixed during lines 2-3, so an epoch is the affine map x <- d x + W psi with
                 d = (1-lr_psi)**n(s,a) and W found once a stream: further epochs cost O(S A), not O(N).
     gauge       exp(beta delta) b = psi(s') exp(-<log psi>), so with z = psi u one table
-                g = exp(beta (r - Delta) - <log psi> + log psi(s)) holds all of lines 9-11.
+                g = exp(beta (r - Delta) - <log psi> + log psi(s)) holds all of lines 9-11. Likewise
+                z = psi^(1-lam) u and g = exp(beta (r - Delta) + (1-lam) (log psi(s) - l)): the same loops.
+    logarithms  where lam is not 0 the psi phase works in logarithms: no power of psi overflows.
     division    with q = 1/rho line 11 is q <- q z' / ((1-lr_rho) z' + lr_rho g z(s',a') q): one division.
 
 What the listing leaves open, and what is done here. ``AlgorithmS1`` reads points 4 and 7 as the authors' script does,
@@ -42,22 +56,25 @@ which made the published Figure 5; ``ListedS1`` is the same class with the listi
    ``rescale_every`` tuples (fast: by powers of two, so no bit of rho or of the policy changes), and to
    mean 1 after each epoch.
 3. ``clip_rho``: rho <= max(1, exp(beta max r)) after each update. The script clips at 1, which holds
-   for r <= 0 only; the wider bound holds for any reward, because sum_s' p b = 1 and delta <= Delta, once
-   <psi> has converged; before, the clip only keeps rho near where its limit lies (docs/theory.md, 5).
+   for r <= 0 only; the wider bound holds for any reward and optimism, because sum_s' p b = 1 and delta <= Delta,
+   once the means of lines 2-3 have converged; before, the clip only keeps rho near where its limit lies
+   (docs/theory.md, 5).
 4. ``rho_init``: "reset" sets rho = exp(-beta) in every biasing iteration (line 8), "carry" only once
    (the script).
 5. <psi> and <log psi> are carried over between biasing iterations (line 1 stands before the loop).
 6. "Relative error" is the largest of |d<psi>|/<psi> and |d<log psi>|/(|<log psi>| + 1e-10) over all
-   pairs, from one epoch to the next.
+   pairs, from one epoch to the next; at another optimism those of ``mean_psi`` and ``mean_log_psi``.
 7. ``self_loop``: where (s',a') = (s,a), line 11 sees the u that line 10 has just written ("new", the
    listing read in order), or the one before ("old", the script).
 8. n_bias counts all iterations, the unbiased first included: the script's n_bias_iter = 5 is 6 here.
 9. ``unvisited``: a pair that never occurs keeps u = 1 of line 7, scaled along with the rest
    ("initial": the listing, the script), or has the value that gives it exactly its prior probability
    ("prior"). A state that never occurs keeps the prior policy either way.
-10. Rewards that vary for the same (s,a) are used as they come: S1 averages exp(beta r), and is
-   optimistic about that noise.
-11. Delta is the maximum over the pairs that occur.
+10. Rewards that vary for the same (s,a) are used as they come: S1 averages exp(beta r), and is optimistic about that
+   noise, whatever ``optimism``, which is about s' alone. At optimism 1 that is the joint convention, the mean of
+   exp(beta (r + V(s'))); at any other it is neither that nor the mean reward.
+11. Delta is the maximum over the pairs that occur; above optimism 1 those that do not, whose delta is 0, count, too (it
+   is a constant that theta does not see).
 12. A pair with prior 0 is an action that the state does not have: its u is 0, and it has no part in the scale of u.
     Tuples that take one, or lead to one as a', are left out.
 """
@@ -66,7 +83,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
@@ -99,8 +116,8 @@ class S1State:
     u: torch.Tensor  # [S, A], mean 1; 0 where the prior is 0
     psi: torch.Tensor  # [S], line 12 of this u
     psi_in_use: torch.Tensor  # [S], behind the present biases
-    mean_psi: torch.Tensor  # [S, A]
-    mean_log_psi: torch.Tensor  # [S, A]
+    mean_psi: torch.Tensor  # [S, A]; <psi^(1-optimism)>^(1/(1-optimism)); 1 at optimism 1, which has no psi phase
+    mean_log_psi: torch.Tensor  # [S, A]; -log <psi^(-optimism)> / optimism, which is <log psi> at 0
     reward_bias: torch.Tensor  # [S, A], line 5; 0 where the stream has no visit
     psi_error: float  # relative error at which the psi phase stopped
     psi_epochs: int  # epochs it took
@@ -180,6 +197,7 @@ class AlgorithmS1(StreamLearner[S1State, S1Stream]):
 
     Args:
         beta: inverse temperature, 1/reward, > 0.
+        optimism: 1 optimistic (control as inference), 0 right, negative robust.
         lr_u, lr_rho, lr_psi: step sizes in (0, 1] of lines 10, 11 and 2-3; lr_rho None is lr_u / n_states.
         n_epochs: passes over the stream per u phase.
         n_bias: biasing iterations, the unbiased first included.
@@ -204,6 +222,7 @@ class AlgorithmS1(StreamLearner[S1State, S1Stream]):
     drawn_from_prior: ClassVar[str] = "a_next"
 
     beta: float = 10.0
+    optimism: float = field(default=0.0, kw_only=True)
     lr_u: float = 0.005
     lr_rho: float | None = None
     lr_psi: float = 0.1
@@ -223,6 +242,7 @@ class AlgorithmS1(StreamLearner[S1State, S1Stream]):
     def __post_init__(self) -> None:
         checks.plain(self)
         checks.temperature("beta", self.beta)
+        checks.optimism("optimism", self.optimism, self.beta)
         checks.step_size("lr_u", self.lr_u)
         if self.lr_rho is not None:
             checks.step_size("lr_rho", self.lr_rho)
@@ -278,6 +298,7 @@ class AlgorithmS1(StreamLearner[S1State, S1Stream]):
             status=status,
             message=message(failure),
             beta=self.beta,
+            optimism=self.optimism,
             history=columns(history),
         )
 
@@ -365,7 +386,7 @@ class AlgorithmS1(StreamLearner[S1State, S1Stream]):
         """Lines 2-8."""
         run = self._psi_phase_fast if self.implementation == "fast" else self._psi_phase_literal
         mean_psi, mean_log_psi, epochs, error = run(state, stream)
-        bias = reward_biases(mean_psi, mean_log_psi, self.beta)
+        bias = reward_biases(mean_psi, mean_log_psi, self.beta, self.optimism)
         if not (positive(mean_psi).all() and np.isfinite(bias).all()):
             raise NonFiniteError(
                 state.n_tuples,
@@ -387,7 +408,7 @@ class AlgorithmS1(StreamLearner[S1State, S1Stream]):
         )
 
     def _psi_phase_fast(self, state: S1State, stream: S1Stream) -> tuple[np.ndarray, np.ndarray, int, float]:
-        mean_psi, mean_log_psi = state.mean_psi.cpu().numpy().copy(), state.mean_log_psi.cpu().numpy().copy()
+        mean_psi, mean_log_psi = (x.cpu().numpy().copy() for x in (state.mean_psi, state.mean_log_psi))
         epochs, error = self.psi_phase(
             stream.psi_map, stream.decay, state.psi.cpu().numpy(), mean_psi.reshape(-1), mean_log_psi.reshape(-1)
         )
@@ -403,8 +424,18 @@ class AlgorithmS1(StreamLearner[S1State, S1Stream]):
     ) -> tuple[int, float]:
         """Lines 2-3 from W and decay [S*A] of a stream and psi [S]; the means [S*A] change in place.
 
-        Returns (epochs, relative error at the end).
+        Returns (epochs, relative error at the end); (0, 0) at optimism 1, which uses neither mean.
         """
+        if self.optimism == 1.0:
+            return 0, 0.0
+        limits = self.psi_tol, LOG_PSI_EPSILON, self.max_psi_epochs
+        if self.optimism:
+            log_mean_psi = np.log(mean_psi)
+            epochs, error = kernels.power_phase(
+                *psi_map, decay, np.log(psi), self.optimism, log_mean_psi, mean_log_psi, *limits
+            )
+            mean_psi[:] = np.exp(log_mean_psi)
+            return int(epochs), float(error)
         epochs, error = kernels.psi_phase(
             *psi_map,
             decay,
@@ -412,34 +443,40 @@ class AlgorithmS1(StreamLearner[S1State, S1Stream]):
             np.log(psi),
             mean_psi,
             mean_log_psi,
-            self.psi_tol,
-            LOG_PSI_EPSILON,
-            self.max_psi_epochs,
+            *limits,
         )
         return int(epochs), float(error)
 
     def _psi_phase_literal(self, state: S1State, stream: S1Stream) -> tuple[np.ndarray, np.ndarray, int, float]:
         mean_psi, mean_log_psi = state.mean_psi.clone(), state.mean_log_psi.clone()
-        psi = state.psi
-        error = math.inf
+        error = 0.0 if self.optimism == 1.0 else math.inf
         epochs = 0
+        of_psi = self._running(state.psi, state.psi.log())
+        means = self._running(mean_psi, mean_log_psi)
         while epochs < self.max_psi_epochs and not error < self.psi_tol:
             epochs += 1
             before, log_before = mean_psi.clone(), mean_log_psi.clone()
             assert isinstance(stream.data, Transitions)
-            listing.psi_epoch(
-                stream.data,
-                _walkable(psi),
-                _walkable(psi.log()),
-                _walkable(mean_psi),
-                _walkable(mean_log_psi),
-                self.lr_psi,
-            )
+            tables = [_walkable(table) for table in (*of_psi, *means)]
+            listing.psi_epoch(stream.data, tables[0], tables[1], tables[2], tables[3], self.lr_psi)
+            mean_psi, mean_log_psi = self._of_running(*means)
             error = max(
                 float(((mean_psi - before).abs() / before).max()),
                 float(((mean_log_psi - log_before).abs() / (log_before.abs() + LOG_PSI_EPSILON)).max()),
             )
         return mean_psi.cpu().numpy(), mean_log_psi.cpu().numpy(), epochs, error
+
+    def _running(self, psi: torch.Tensor, log_psi: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """What lines 2-3 average: psi^(1-optimism), and log psi or psi^(-optimism)."""
+        if self.optimism == 0.0:
+            return psi, log_psi
+        return psi ** (1 - self.optimism), (-self.optimism * log_psi).exp()
+
+    def _of_running(self, first: torch.Tensor, second: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """``_running`` undone: (mean_psi, mean_log_psi)."""
+        if self.optimism == 0.0:
+            return first.clone(), second.clone()
+        return first ** (1 / (1 - self.optimism)), second.log() / -self.optimism
 
     def _u_epoch_fast(self, state: S1State, stream: S1Stream) -> tuple[np.ndarray, float, int]:
         n_states, n_actions = state.u.shape
@@ -451,8 +488,10 @@ class AlgorithmS1(StreamLearner[S1State, S1Stream]):
             psi,
             self.beta,
             state.prior_policy.cpu().numpy(),
+            self.optimism,
         )
-        z = state.u.cpu().numpy() * psi[:, None]
+        scale = gauge(psi, self.optimism)[:, None]
+        z = state.u.cpu().numpy() * scale
         g, table = g.reshape(-1), z.reshape(-1)  # views: the kernel writes into z
         rescale_every = self.rescale(n_states * n_actions)
         inv_rho = 1 / state.rho
@@ -479,16 +518,19 @@ class AlgorithmS1(StreamLearner[S1State, S1Stream]):
                     first,
                 )
                 if t < stop:
-                    return z / psi[:, None], _inverse(inv_rho), t
-        return z / psi[:, None], _inverse(inv_rho), t
+                    return z / scale, _inverse(inv_rho), t
+        return z / scale, _inverse(inv_rho), t
 
     def _u_epoch_literal(self, state: S1State, stream: S1Stream) -> tuple[np.ndarray, float, int]:
         u = state.u.clone()
         assert isinstance(stream.data, Transitions)
+        psi, mean_psi = state.psi_in_use, state.mean_psi
+        if self.optimism:
+            psi, mean_psi = psi ** (1 - self.optimism), mean_psi ** (1 - self.optimism)
         rho, t = listing.u_epoch(
             stream.data,
-            _walkable(state.psi_in_use),
-            _walkable(state.mean_psi),
+            _walkable(psi),
+            _walkable(mean_psi),
             _walkable(state.reward_bias),
             state.reward_bias_max,
             _walkable(u),
@@ -552,10 +594,24 @@ def positive(table: np.ndarray) -> np.ndarray:
     return np.isfinite(table) & (table > 0)  # type: ignore[no-any-return]
 
 
-def reward_biases(mean_psi: np.ndarray, mean_log_psi: np.ndarray, beta: float | np.ndarray) -> np.ndarray:
-    """delta [..., S, A] of line 5, reward; beta a number, or an array that broadcasts."""
+def reward_biases(
+    mean_psi: np.ndarray,
+    mean_log_psi: np.ndarray,
+    beta: float | np.ndarray,
+    optimism: float | np.ndarray = 0.0,
+) -> np.ndarray:
+    """delta [..., S, A] of line 5, reward; beta and optimism numbers, or arrays that broadcast."""
     # <psi> >= exp(<log psi>) by Jensen; the two running means keep that up to rounding.
-    return np.maximum((np.log(mean_psi) - mean_log_psi) / beta, 0.0)  # type: ignore[no-any-return]
+    found = (1 - optimism) * np.maximum((np.log(mean_psi) - mean_log_psi) / beta, 0.0)
+    return found + 0.0  # type: ignore[no-any-return]  # no -0
+
+
+def gauge(psi: np.ndarray, optimism: float) -> np.ndarray:
+    """z / u [S], up to a constant factor: psi^(1-optimism), at most 1 where optimism is not 0."""
+    if optimism == 0.0:
+        return psi
+    exponent = (1 - optimism) * np.log(psi)
+    return np.exp(exponent - exponent.max())  # type: ignore[no-any-return]
 
 
 def gains(
@@ -565,11 +621,13 @@ def gains(
     psi: np.ndarray,
     beta: float | np.ndarray,
     prior: np.ndarray,
+    optimism: float | np.ndarray = 0.0,
 ) -> np.ndarray:
-    """g [..., S, A] of the gauge z = psi u; psi [..., S] is the one behind the biases. -1 marks pairs with prior 0, for
-    the kernels: no tuple has them, and their z = 0 is no sign of an underflow."""
+    """g [..., S, A] of the gauge z = psi^(1-optimism) u; psi [..., S] is the one behind the biases. -1 marks pairs with
+    prior 0, for the kernels: no tuple has them, and their z = 0 is no sign of an underflow."""
     largest = reward_bias.max((-2, -1), keepdims=True)  # line 6
-    g = np.exp(beta * (reward - largest) - mean_log_psi + np.log(psi)[..., None])
+    left = 1 - optimism
+    g = np.exp(beta * (reward - largest) - left * mean_log_psi + left * np.log(psi)[..., None])
     g[..., prior == 0] = -1.0
     return g  # type: ignore[no-any-return]
 

@@ -65,6 +65,59 @@ def psi_phase(indptr, indices, data, decay, psi, log_psi, mean_psi, mean_log_psi
     return epochs, change
 
 
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def _mixed(x, y, keep, exponent):
+    """log (keep exp(exponent x) + (1 - keep) exp(exponent y)) / exponent, between x and y; their mean at 0."""
+    if keep == 1.0 or x == y:
+        return x
+    if keep == 0.0:
+        return y
+    difference = exponent * (y - x)
+    if difference == 0.0:
+        return keep * x + (1.0 - keep) * y
+    if difference < 0.0:  # from the larger term: nothing overflows
+        excess, rest = (1.0 - keep) * np.expm1(difference), keep + (1.0 - keep) * np.exp(difference)
+        return x + (np.log1p(excess) if excess > -0.5 else np.log(rest)) / exponent
+    excess, rest = keep * np.expm1(-difference), (1.0 - keep) + keep * np.exp(-difference)
+    return y + (np.log1p(excess) if excess > -0.5 else np.log(rest)) / exponent
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def power_phase(
+    indptr, indices, data, decay, log_psi, optimism, log_mean_psi, mean_log_psi, tolerance, epsilon, max_epochs
+):
+    """``psi_phase`` where optimism is not 0, in logarithms throughout; tables change in place.
+
+    log_mean_psi [n_pairs]: log <psi^(1-optimism)> / (1-optimism); mean_log_psi: -log <psi^(-optimism)> / optimism.
+    Sums of the stream's weights are 1 - decay, so that an epoch mixes each table with the stream's own mean. Returns
+    (epochs, last relative change of exp(log_mean_psi) and mean_log_psi).
+    """
+    n_pairs = decay.size
+    own = np.zeros((2, n_pairs))
+    for k in range(n_pairs):
+        total = 0.0
+        for m in range(indptr[k], indptr[k + 1]):
+            if data[m] > 0.0:
+                total += data[m]
+                keep = (total - data[m]) / total
+                own[0, k] = _mixed(own[0, k], log_psi[indices[m]], keep, 1.0 - optimism)
+                own[1, k] = _mixed(own[1, k], log_psi[indices[m]], keep, -optimism)
+    change = np.inf
+    epochs = 0
+    while epochs < max_epochs:
+        epochs += 1
+        change = 0.0
+        for k in range(n_pairs):
+            x, y = log_mean_psi[k], mean_log_psi[k]
+            log_mean_psi[k] = _mixed(x, own[0, k], decay[k], 1.0 - optimism)
+            change = max(change, abs(np.expm1(log_mean_psi[k] - x)))
+            mean_log_psi[k] = _mixed(y, own[1, k], decay[k], -optimism)
+            change = max(change, abs(mean_log_psi[k] - y) / (epsilon + abs(y)))
+        if not change >= tolerance:  # also leaves on NaN
+            break
+    return epochs, change
+
+
 @intrinsic
 def _fma(typing, a, b, c):
     """a * b + c with one rounding: written out, since what a compiler fuses by itself differs from loop to loop."""

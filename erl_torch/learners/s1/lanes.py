@@ -25,7 +25,16 @@ from erl_torch.experience.transitions import Transitions
 from erl_torch.learners.learner import NonFiniteError, StreamLearner
 from erl_torch.learners.s1 import device as s1_torch
 from erl_torch.learners.s1 import kernels
-from erl_torch.learners.s1.algorithm import AlgorithmS1, S1State, S1Stream, gains, line_12, positive, reward_biases
+from erl_torch.learners.s1.algorithm import (
+    AlgorithmS1,
+    S1State,
+    S1Stream,
+    gains,
+    gauge,
+    line_12,
+    positive,
+    reward_biases,
+)
 from erl_torch.learners.together import Together
 from erl_torch.rng import streams
 
@@ -206,6 +215,10 @@ class Engine:
         return np.array([learner.beta for learner in self.learners])
 
     @cached_property
+    def optimism(self) -> np.ndarray:
+        return np.array([learner.optimism for learner in self.learners])
+
+    @cached_property
     def n_pairs(self) -> int:
         return self.n_states * self.n_actions
 
@@ -328,8 +341,8 @@ class Engine:
         n = len(learners)
 
         def prepared(r: int) -> S1Stream:
-            # Streams are the same at any beta, but for what is made of beta below; at this one nothing overflows.
-            learner: AlgorithmS1 = replace(learners[r], beta=checks.SMALLEST_BETA)
+            # Streams are the same at any beta and optimism, but for what is made of beta below; here nothing overflows.
+            learner: AlgorithmS1 = replace(learners[r], beta=checks.SMALLEST_BETA, optimism=0.0)
             return learner.prepare(tuples_of(self.experience, r, self.prior), self.n_states, self.n_actions)
 
         if shared:
@@ -498,10 +511,11 @@ class Engine:
         mean_psi, mean_log_psi = state.mean_psi.copy(), state.mean_log_psi.copy()
 
         def psi_phase(r: int) -> tuple[int, float]:
-            return self.learner.psi_phase(
+            return self.learners[r].psi_phase(
                 lanes.psi_maps[r], lanes.decay[r], state.psi[r], mean_psi[r].reshape(-1), mean_log_psi[r].reshape(-1)
             )
 
+        beta, optimism = self.beta[:, None, None], self.optimism[:, None, None]
         epochs, error = map(np.array, zip(*pool.map(psi_phase, range(len(self.replicas))), strict=True))
         reset = self.learner.rho_init == "reset" or state.bias_iteration == 0
         return replace(
@@ -509,7 +523,7 @@ class Engine:
             psi_in_use=state.psi,
             mean_psi=mean_psi,
             mean_log_psi=mean_log_psi,
-            reward_bias=reward_biases(mean_psi, mean_log_psi, self.beta[:, None, None]),
+            reward_bias=reward_biases(mean_psi, mean_log_psi, beta, optimism),
             psi_epochs=epochs,
             psi_error=error,
             psi_converged=state.psi_converged & (error < self.learner.psi_tol),
@@ -521,9 +535,14 @@ class Engine:
         self, state: LanesState, lanes: Lanes, pool: ThreadPoolExecutor
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(u [R, S, A], rho [R], whether all numbers stayed positive and finite [R]) after lines 9-11."""
-        beta = self.beta[:, None, None]
-        g = gains(lanes.reward, state.reward_bias, state.mean_log_psi, state.psi_in_use, beta, self.prior)
-        z = state.u * state.psi_in_use[:, :, None]
+        beta, optimism = self.beta[:, None, None], self.optimism[:, None, None]
+        psi = state.psi_in_use
+        g = gains(lanes.reward, state.reward_bias, state.mean_log_psi, psi, beta, self.prior, optimism)
+        of_psi = psi
+        if optimism.any():
+            of_psi = np.stack([gauge(*one) for one in zip(psi, self.optimism.tolist(), strict=True)])
+        scale = of_psi[:, :, None]
+        z = state.u * scale
         g, z = (x.reshape(len(self.replicas), self.n_pairs) for x in (g, z))
         q = 1 / state.rho
         learners = self.learners
@@ -545,6 +564,6 @@ class Engine:
             z[part] = turn(table)
 
         list(pool.map(run, lanes.blocks))
-        u = z.reshape(state.u.shape) / state.psi_in_use[:, :, None]
+        u = z.reshape(state.u.shape) / scale
         rho = np.where(q > 0, 1 / q, math.inf)
         return u, rho, failed < 0

@@ -19,7 +19,10 @@ Table = Any  # torch.Tensor or np.ndarray: arithmetic of items of either has no 
 def psi_epoch(
     data: Transitions, psi: Table, log_psi: Table, mean_psi: Table, mean_log_psi: Table, lr_psi: float
 ) -> None:
-    """Lines 2-3 over the whole stream; mean_psi and mean_log_psi [S, A] change in place."""
+    """Lines 2-3 over the whole stream; mean_psi and mean_log_psi [S, A] change in place.
+
+    Where optimism is not 0, psi^(1-optimism) and psi^(-optimism) stand for psi and log psi.
+    """
     for s, a, s_next in zip(data.s.tolist(), data.a.tolist(), data.s_next.tolist(), strict=True):
         mean_psi[s, a] = (1 - lr_psi) * mean_psi[s, a] + lr_psi * psi[s_next]  # line 2
         mean_log_psi[s, a] = (1 - lr_psi) * mean_log_psi[s, a] + lr_psi * log_psi[s_next]  # line 3
@@ -42,6 +45,8 @@ def u_epoch(
     rescale_every: int,
 ) -> tuple[float, int]:
     """Lines 9-11 over the whole stream; u [S, A] changes in place.
+
+    Where optimism is not 0, psi^(1-optimism) and its mean stand for psi and mean_psi.
 
     Returns (rho, t): t = N, or the first tuple whose update is not a positive finite number.
     """
