@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -19,6 +20,7 @@ MAX_PX = 400  # TensorBoard's image cards are about this wide
 # Those of Okabe and Ito, which any colour vision tells apart, and three more.
 COLOURS = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#222222", "#7b3294", "#8c6d31", "#9a9a9a"]
 MARKERS = "os^"
+LETTERS = 24  # of a label, at most
 MOST_ROWS, MOST_COLUMNS = 30, 12  # of a table whose rows or columns are named
 
 
@@ -31,8 +33,8 @@ def table_picture(
     """
     figure = Figure(figsize=(max_px / DPI, max_px / DPI), dpi=DPI)
     states, actions = names
-    rows = [] if states is None or len(states) > MOST_ROWS else [_brief(x) for x in states.texts.tolist()]
-    columns = [] if actions is None or len(actions) > MOST_COLUMNS else [_brief(x) for x in actions.texts.tolist()]
+    rows = [] if states is None or len(states) > MOST_ROWS else brief(states.texts.tolist())
+    columns = [] if actions is None or len(actions) > MOST_COLUMNS else brief(actions.texts.tolist())
     # 7 points of type are about 5 pixels a letter.
     left = 0.13 + 5 / max_px * max(map(len, rows), default=0)
     slanted = sum(map(len, columns)) * 6 > (0.78 - left) * max_px
@@ -51,10 +53,29 @@ def table_picture(
     return pixels(figure)
 
 
-def _brief(label: str) -> str:
-    """A label on one line, at most 24 letters long, that matplotlib takes for no formula."""
-    line = " ".join(label.split())
-    return (line if len(line) <= 24 else f"{line[:23]}\u2026").replace("$", r"\$")
+def brief(labels: Sequence[str]) -> list[str]:
+    """Labels on one line each, at most 24 letters long and as different as they were, that matplotlib takes for no
+    formula: cut at their ends, else in their middles, else without what all begin and end with, else after numbers."""
+    lines = [" ".join(label.split()) for label in labels]
+    both = (lines, [line[::-1] for line in lines])
+    head, tail = (len(os.path.commonprefix(x)) for x in both)  # noqa: RUF071  of texts
+    shortest = min(map(len, lines), default=0)
+    inner = [line[head : len(line) - min(tail, shortest - head)] for line in lines]
+    ways = (
+        [_cut(line, LETTERS - 1) for line in lines],
+        [_cut(line, LETTERS // 2) for line in lines],
+        [_cut(f"\u2026{line}\u2026", LETTERS - 1) for line in inner],
+        [_cut(f"\u2026{line}\u2026", LETTERS // 2) for line in inner],
+    )
+    numbered = [_cut(f"{i}: {line}", LETTERS - 1) for i, line in enumerate(lines)]
+    found = next((way for way in ways if len(set(way)) == len(set(labels))), numbered)
+    return [line.replace("$", r"\$") for line in found]
+
+
+def _cut(line: str, first: int) -> str:
+    """Its ``first`` letters and the last, ``LETTERS`` in all, where it is longer."""
+    last = LETTERS - 1 - first
+    return line if len(line) <= LETTERS else f"{line[:first]}\u2026{line[len(line) - last :]}"
 
 
 def learning_curves(sizes: Sequence[int], curves: Mapping[str, Sequence[Mapping[str, Any]]], title: str) -> np.ndarray:

@@ -269,6 +269,11 @@ def true_theta(charge):
     return -(v - before)[0]
 
 
+def test_the_mean_of_large_rewards():
+    frame = dict(s=[0, 1, 0, 1], a=[0] * 4, r=[1.5e308, 1.5e308, 1.5e308, -1.5e308], terminated=[0, 0, 0, 1])
+    assert read_log(frame).report.mean_reward == pytest.approx(0.75e308, rel=1e-12)
+
+
 @pytest.mark.parametrize(("limit", "step"), [(3, True), (6, False)])
 def test_a_time_limit_selects_no_ends(limit, step):
     """Rows that are cut are left out, so those that end in the same place must be: else ends are too frequent."""
@@ -555,6 +560,11 @@ def test_types_are_judged_by_the_column_not_its_first_batch(tmp_path):
         ("noflag.csv", b"s,a,r,done\n0,0,1,\n", r"terminated\[0\] \(done\)=missing: must be true or false"),
         ("lost.csv", b"s,a,r,done\nx,0,1,0\n,0,1,1\n", r"s\[1\]=missing: must be one of x"),
         ("down.csv", b"episode,t,s,a,r\n1,3,0,0,1\n1,2,1,0,1\n1,1,0,0,1\n", "t=steps of -1: must be in order of time"),
+        (
+            "nul.csv",
+            b"s,a,r,done\nx,0,1,0\ny\0,0,1,1\n",
+            r"nul.csv: s='y.x00': must be a text without the character NUL",
+        ),
         ("latin.csv", "s,a,r,done\né,0,1,1\n".encode("latin-1"), "must be a readable CSV file"),
         (
             "cut.csv.gz",
@@ -752,6 +762,11 @@ def test_a_log_resumes_sweeps_and_varies(tmp_path, shop, typed_here):
         (
             ("experience.columns.s=colour",),
             "experience.columns.s=colour: must be a column of shop.csv; the columns are",
+        ),
+        (
+            ("experience.columns.s=null",),
+            "experience.path=shop.csv: s=missing: must be a column named s, state, states, obs, observation, "
+            "observations, or any other: experience.columns.s=NAME; the columns are",
         ),
         (("experience.on_bad=stop",), r"experience.path=shop.csv: r\["),
         (("learner.prior_policy=p.npy",), "learner.prior_policy=array of shape (2, 2): must be of shape [4, 3]"),

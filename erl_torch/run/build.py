@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -82,7 +83,12 @@ def group(name: str) -> Iterator[None]:
     try:
         yield
     except InputError as error:
-        raise error.within(name) from error
+        own = error.within(name)
+        # Keys in the text too: columns.s=NAME is experience.columns.s=NAME.
+        own = InputError(
+            own.key, own.value, re.sub(r"(?<![\w.])columns\.(?=\w+(=NAME| has))", f"{name}.columns.", own.allowed)
+        )
+        raise own from error
 
 
 def make_env(cfg: DictConfig, render_mode: str | None = None) -> gym.Env[Any, Any]:
@@ -123,7 +129,11 @@ def make_env(cfg: DictConfig, render_mode: str | None = None) -> gym.Env[Any, An
                 raise
             message = f"{type(error).__name__}: {error}"
             name = spec if isinstance(spec, str) else keys["class"]
-            raise InputError("kwargs", arguments, f"arguments of {name} ({message})") from error
+            allowed = f"arguments of {name} ({message})"
+            if keys.get("kwargs") or not arguments:
+                raise InputError("kwargs", arguments, allowed) from error
+            *others, (last, value) = arguments.items()  # as they were typed
+            raise InputError("".join(f"{k}={v} env." for k, v in others) + last, value, allowed) from error
         binning = {key: keys.get(key) for key in ("bins", "low", "high", "actions") if key not in arguments}
         if any(value is not None for value in binning.values()):
             return Discretise(env, **binning)

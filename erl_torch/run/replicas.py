@@ -116,6 +116,7 @@ class ReplicaRecorder:
         for text in texts:
             note(text)
         dial = [(group.beta, group.optimism) for group in self.groups]
+        self.proven: dict[tuple[float, float], tuple[float, float] | None] = {}  # of theta*, by beta and optimism
         found = {each: self._optimum(*each) for each in dict.fromkeys(dial)}
         self.optima = [found[each] for each in dial]
         self.table = with_own(learners[0].quantities)
@@ -130,6 +131,7 @@ class ReplicaRecorder:
         optimum = solve_soft_bellman(model, beta, self.problem.prior, optimism=optimism)
         if optimum.status is not Status.CONVERGED or optimum.theta is None:
             return {}
+        self.proven[beta, optimism] = optimum.theta_bounds
         figures = {"theta": optimum.theta, "delta_max": optimum.reward_bias_max, "objective": -optimum.theta}
         if self.judges.of_dial:
             figures["objective_real"] = self.judges.of_model.objective(optimum.policy.numpy(), beta)
@@ -238,8 +240,10 @@ class ReplicaRecorder:
         rows = self.recorded.rows["objective"] if exact else [np.full(len(solution), np.nan)]
         return [
             reservations.of_outcome(one.status, one.message, float(learnt), float(prior))
-            + reservations.of_theta(one.theta, *against)
-            for one, learnt, prior, against in zip(solution.solutions, rows[-1], rows[0], self.data, strict=True)
+            + reservations.of_theta(one.theta, *against, self.proven.get((of.beta, of.optimism)))
+            for one, of, learnt, prior, against in zip(
+                solution.solutions, self.replicas.learners, rows[-1], rows[0], self.data, strict=True
+            )
         ]
 
     def save(self, solution: ReplicaSolution, directory: Path) -> None:

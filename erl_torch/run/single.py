@@ -268,7 +268,8 @@ class SingleRecorder:
         exact = (self.last.objective, self.first.objective) if self.model is not None else (np.nan, np.nan)
         noted = reservations.of_outcome(solution.status, solution.message, *exact)
         if self.counts is not None:
-            noted += reservations.of_theta(solution.theta, self.counts.tally.reward_range, self.estimate)
+            known = self.counts.tally.reward_range, self.estimate, solution.theta_bounds
+            noted += reservations.of_theta(solution.theta, *known)
         for _, text in noted:
             note(text)
         rate = position / max(outcome.seconds, 1e-9)
