@@ -122,6 +122,19 @@ def test_steps_of_an_environment_that_does_not_tell():
             EndReward(env, end_reward, rule)
 
 
+@pytest.mark.parametrize(
+    ("env_id", "end_reward", "failures"),
+    [("CliffWalking-v1", -5.0, "default"), ("CliffWalking-v1", 5.0, "unpaid"), ("FrozenLake-v1", -1.0, [0])],
+)
+def test_what_no_end_gets_is_refused_from_steps_as_of_the_model(env_id, end_reward, failures):
+    said = []
+    for make in (EndReward, lambda env, x, rule: tabular_mdp(env, end_reward=x, failures=rule)):
+        with pytest.raises(InputError, match=f"end_reward={end_reward}: must be 0, or a") as error:
+            make(gym.make(env_id), end_reward, failures)
+        said.append(str(error.value))
+    assert said[0] == said[1]
+
+
 def test_ends_of_a_windy_lake():
     env = gym.make("erl_torch/WindyFrozenLake-v0", desc=["SHG"], cyclic=False)
     mdp = tabular_mdp(env, end_reward=-7.0)

@@ -292,6 +292,8 @@ def test_a_break_even_way_round_is_not_solved():
     found = solve_first_exit(loop(np.log(2)), 1.0)
     assert found.status is Status.STAGNATED
     assert "which rounding hides" in found.message
+    assert not found.solved.any()  # so that the policy is the prior
+    assert found.value[0].isnan()
     assert found.value_high[0].item() == np.inf
 
 
@@ -491,6 +493,29 @@ def test_episodes_that_never_end():
     cliff = tabular_mdp(gym.make("CliffWalking-v1"), "absorb")
     assert (figures := evaluate_episodes(cliff, np.eye(4)[np.zeros(48, int)])).steps.low == np.inf
     assert (figures.mean_return.low, figures.mean_return.high) == (-np.inf, np.inf)
+
+
+def test_what_is_beyond_double_precision_is_no_number():
+    """60 steps forward in a row, with chance 1e-6 each, else back: 1e360 steps."""
+    n = 61
+    p = np.zeros((n, 1, n))
+    p[np.arange(n - 1), 0, np.arange(1, n)] = 1e-6
+    p[: n - 1, 0, 0] += 1 - 1e-6
+    p[-1, 0, -1] = 1
+    mdp = TabularMDP(p, np.append(-np.ones(n - 1), 0.0)[:, None], np.eye(n)[0])
+    figures = evaluate_episodes(mdp, np.ones((n, 1)))
+    for figure, low in zip(figures, (-np.inf, 0.0, 0.0), strict=True):
+        assert np.isnan(figure.value)
+        assert figure.low == low
+    assert (figures.mean_return.high, figures.success_rate.high, figures.steps.high) == (np.inf, 1.0, np.inf)
+    found = solve_first_exit(mdp, 1.0)
+    assert found.status is Status.STAGNATED
+    assert not found.solved.any()
+    assert found.value[:-1].isnan().all()
+    assert found.steps[:-1].isnan().all()
+    assert found.action_value[:-1].isnan().all()
+    assert (found.value_low[:-1] == -np.inf).all()
+    assert (found.value_high[:-1] == np.inf).all()
 
 
 # -- missing actions --------------------------------------------------------------------------------------------------
