@@ -213,6 +213,22 @@ def test_random_logs(seed):
     frame = {name: [row[name] for row in rows] for name in names}
     log = read_log(frame)
     assert named(log) == reference(rows, **there)
+    report, after = log.report, [*rows[1:], None]
+    ends = [b is None or any(there[x] and a[x] for x in ("terminated", "truncated"))
+            or (there["episode"] and a["episode"] != b["episode"]) for a, b in zip(rows, after, strict=True)]  # fmt: skip
+    if there["episode"] or there["terminated"] or there["truncated"]:
+        terminated = sum(there["terminated"] and row["terminated"] for row in rows)
+        truncated = sum(
+            there["truncated"] and row["truncated"] for row in rows if not (there["terminated"] and row["terminated"])
+        )
+        assert (report.episodes, report.terminated, report.truncated) == (sum(ends), terminated, truncated)
+        assert report.cut == sum(ends) - terminated - truncated >= 0
+    if there["s_next"]:
+        assert report.gaps == sum(a["s_next"] != b["s"] for a, b, end in zip(rows, after, ends, strict=True) if not end)
+    frame["r"] = [None if rng.random() < 0.1 else r for r in frame["r"]]
+    spoilt = read_log(frame, on_bad="skip").report
+    assert spoilt.tuples + spoilt.bad + spoilt.last + spoilt.before_gaps == spoilt.rows
+    frame["r"] = [row["r"] for row in rows]
     for chunk in (1, 7):
         pieces = read_log(frame, chunk=chunk)
         assert isinstance(pieces.experience, FileRecording)
@@ -883,6 +899,14 @@ def test_ends_that_nothing_counts_for(tmp_path, text, arguments, said):
     with pytest.raises(InputError) as caught:
         read_log(tmp_path / "log.csv", **arguments)
     assert said in str(caught.value)
+
+
+def test_the_end_of_a_bad_row_tells_nothing(tmp_path):
+    """The best end, beside which others fail, is that of the rows that count."""
+    path = tmp_path / "log.csv"
+    path.write_text(ENDS.replace("go,2,1", "go,0,1").replace("go,-1,1", "go,0,1") + ",go,9,1\n")
+    with pytest.raises(InputError, match="no end is a failure"):
+        read_log(path, on_bad="skip", end_reward=-3)
 
 
 def test_auto_needs_a_model(tmp_path):
