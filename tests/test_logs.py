@@ -214,8 +214,12 @@ def test_random_logs(seed):
     log = read_log(frame)
     assert named(log) == reference(rows, **there)
     report, after = log.report, [*rows[1:], None]
-    ends = [b is None or any(there[x] and a[x] for x in ("terminated", "truncated"))
-            or (there["episode"] and a["episode"] != b["episode"]) for a, b in zip(rows, after, strict=True)]  # fmt: skip
+    ends = [
+        b is None
+        or any(there[x] and a[x] for x in ("terminated", "truncated"))
+        or (there["episode"] and a["episode"] != b["episode"])
+        for a, b in zip(rows, after, strict=True)
+    ]
     if there["episode"] or there["terminated"] or there["truncated"]:
         terminated = sum(there["terminated"] and row["terminated"] for row in rows)
         truncated = sum(
