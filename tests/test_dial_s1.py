@@ -143,7 +143,7 @@ def test_expected_update_vanishes_at_the_exact_iterations(implementation, optimi
     exact = exact_lines(p, mdp.reward, prior, 3.0, optimism, k + 1)[k]
     lr = 1e-7
     learner = AlgorithmS1(
-        3.0, optimism, lr, lr, n_epochs=5, n_bias=9, prior_policy=prior, implementation=implementation
+        3.0, lr, lr, optimism=optimism, n_epochs=5, n_bias=9, prior_policy=prior, implementation=implementation
     )  # fmt: skip
     tables = {"psi_in_use": "psi", "mean_psi": "mean_psi", "mean_log_psi": "mean_log_psi", "reward_bias": "delta"}
     state = replace(

@@ -232,6 +232,26 @@ def test_random_logs(seed):
     frame = {name: [row[name] for row in rows] for name in names}
     log = read_log(frame)
     assert named(log) == reference(rows, **there)
+    report, after = log.report, [*rows[1:], None]
+    ends = [
+        b is None
+        or any(there[x] and a[x] for x in ("terminated", "truncated"))
+        or (there["episode"] and a["episode"] != b["episode"])
+        for a, b in zip(rows, after, strict=True)
+    ]
+    if there["episode"] or there["terminated"] or there["truncated"]:
+        terminated = sum(there["terminated"] and row["terminated"] for row in rows)
+        truncated = sum(
+            there["truncated"] and row["truncated"] for row in rows if not (there["terminated"] and row["terminated"])
+        )
+        assert (report.episodes, report.terminated, report.truncated) == (sum(ends), terminated, truncated)
+        assert report.cut == sum(ends) - terminated - truncated >= 0
+    if there["s_next"]:
+        assert report.gaps == sum(a["s_next"] != b["s"] for a, b, end in zip(rows, after, ends, strict=True) if not end)
+    frame["r"] = [None if rng.random() < 0.1 else r for r in frame["r"]]
+    spoilt = read_log(frame, on_bad="skip").report
+    assert spoilt.tuples + spoilt.bad + spoilt.last + spoilt.before_gaps == spoilt.rows
+    frame["r"] = [row["r"] for row in rows]
     for chunk in (1, 7):
         pieces = read_log(frame, chunk=chunk)
         assert isinstance(pieces.experience, FileRecording)
@@ -539,6 +559,75 @@ def test_types_are_judged_by_the_column_not_its_first_batch(tmp_path):
     assert len(log.experience) == n + 1
 
 
+@pytest.mark.parametrize("given", [False, True])
+def test_a_next_of_a_log_made_with_the_prior_has_the_chances_of_its_state(given):
+    """Prior rows differ by state; a row's action tells where it was drawn. In between, behind ends, and behind gaps."""
+    rng = np.random.default_rng(3)
+    n = 20_000
+    prior = np.array([[0.999, 0.001], [0.001, 0.999]])
+    truncated, gap = (rng.random(n) < 0.2 for _ in range(2))
+    terminated = (rng.random(n) < 0.2) & ~truncated
+    gap &= ~terminated & ~truncated
+    s = rng.integers(2, size=n)
+    a = (rng.random(n) < prior[s, 1]).astype(int)
+    s_next = np.where(gap | terminated | truncated, 1 - np.roll(s, -1), np.roll(s, -1))
+    frame = dict(s=s, a=a, r=np.ones(n), s_next=s_next, terminated=terminated, truncated=truncated)
+    if given:  # at an end, what was drawn in the state where the episode ended
+        frame["a_next"] = np.where(terminated, 1 - np.roll(s, -1), (rng.random(n) < prior[s_next, 1]).astype(int))
+    log = read_log(frame, prior_policy=prior, on_prior=not given)
+    data = log.experience
+    assert len(data.s) == n
+    assert log.report.gaps == gap[:-1].sum()
+    assert np.array_equal(data.s_next, np.where(terminated, np.roll(s, -1), s_next))
+    inside = ~(gap | terminated | truncated)
+    for rows in (inside, truncated, terminated, gap):
+        for state in range(2):
+            drawn = data.a_next[rows & (data.s_next.astype(int) == state)]
+            deviation = np.sqrt(0.001 * 0.999 / len(drawn))
+            assert abs(drawn.mean() - prior[state, 1]) < 5 * deviation + 1 / len(drawn)
+    if not given:
+        assert np.array_equal(data.a_next[:-1][inside[:-1]], a[1:][inside[:-1]])
+
+
+def test_a_next_that_the_prior_lacks_is_drawn():
+    rng = np.random.default_rng(4)
+    prior = np.array([[0.5, 0.5, 0.0], [0.0, 0.5, 0.5]])
+    s, s_next = rng.integers(2, size=(2, 4000))
+    a = np.where(s == 0, rng.integers(2, size=4000), 1 + rng.integers(2, size=4000))
+    frame = dict(s=s, a=a, r=np.ones(4000), s_next=s_next, a_next=rng.integers(3, size=4000))
+    data = read_log(frame, prior_policy=prior).experience
+    assert len(data.s) == 4000
+    has = prior[s_next, frame["a_next"]] > 0
+    assert np.array_equal(data.a_next[has], frame["a_next"][has])
+    assert (prior[data.s_next, data.a_next] > 0).all()
+    again = data.a_next[~has & (s_next == 0)]
+    assert abs(again.mean() - 0.5) < 5 * 0.5 / np.sqrt(len(again))
+
+
+def test_an_episode_that_is_not_told():
+    """Nothing is known of a row without its episode: neither what it leads to, nor what led to it."""
+    rows = [{"s": i % 3, "a": 0, "r": float(i), "episode": 0, "step": i, "terminated": False} for i in range(8)]
+    rows[3]["episode"] = None
+    frame = pa.Table.from_pylist(rows)
+    with pytest.raises(InputError, match=r"episode\[3\]=missing: must be there"):
+        read_log(frame)
+    log = read_log(frame, on_bad="skip")
+    assert log.experience.r.tolist() == [0, 1, 4, 5, 6]
+    assert (log.report.bad, log.report.first_bad) == (1, "episode[3]=missing")
+    nowhere = frame.set_column(3, "episode", pa.nulls(8, pa.int64()))
+    with pytest.raises(InputError, match=r"episode\[0\]=missing: must be there"):
+        read_log(nowhere)
+
+
+def test_steps_that_go_down_without_a_column_of_episodes_are_gaps():
+    """An episode may have been cut there, and another one begun."""
+    frame = dict(s=[0, 1, 2, 0, 1, 2], a=[0] * 6, r=[0.0, 1, 2, 3, 4, 5], step=[0, 1, 2, 0, 1, 2],
+                 terminated=[False] * 5 + [True])  # fmt: skip
+    log = read_log(frame)
+    assert log.experience.r.tolist() == [0, 1, 3, 4, 5]
+    assert log.report.before_gaps == 1
+
+
 # -- hostile files -----------------------------------------------------------------------------------------------
 
 
@@ -559,11 +648,20 @@ def test_types_are_judged_by_the_column_not_its_first_batch(tmp_path):
         ("flag.csv", b"s,a,r,done\n0,0,1,maybe\n", r"terminated\[0\] \(done\)=maybe: must be true or false"),
         ("noflag.csv", b"s,a,r,done\n0,0,1,\n", r"terminated\[0\] \(done\)=missing: must be true or false"),
         ("lost.csv", b"s,a,r,done\nx,0,1,0\n,0,1,1\n", r"s\[1\]=missing: must be one of x"),
-        ("down.csv", b"episode,t,s,a,r\n1,3,0,0,1\n1,2,1,0,1\n1,1,0,0,1\n", "t=steps of -1: must be in order of time"),
         (
             "nul.csv",
             b"s,a,r,done\nx,0,1,0\ny\0,0,1,1\n",
             r"nul.csv: s='y.x00': must be a text without the character NUL",
+        ),
+        (
+            "down.csv",
+            b"episode,t,s,a,r\n1,3,0,0,1\n1,2,1,0,1\n1,1,0,0,1\n",
+            r"t\[1\]=2: must be at least 3, that of the row before: steps of an episode are in order of time",
+        ),
+        (
+            "mixed.csv",
+            b"episode,t,s,a,r\n0,0,0,0,1\n0,2,1,0,1\n0,1,0,0,1\n0,3,0,0,1\n",
+            r"t\[2\]=1: must be at least 2",
         ),
         ("latin.csv", "s,a,r,done\né,0,1,1\n".encode("latin-1"), "must be a readable CSV file"),
         (
@@ -935,6 +1033,14 @@ def test_ends_that_nothing_counts_for(tmp_path, text, arguments, said):
     with pytest.raises(InputError) as caught:
         read_log(tmp_path / "log.csv", **arguments)
     assert said in str(caught.value)
+
+
+def test_the_end_of_a_bad_row_tells_nothing(tmp_path):
+    """The best end, beside which others fail, is that of the rows that count."""
+    path = tmp_path / "log.csv"
+    path.write_text(ENDS.replace("go,2,1", "go,0,1").replace("go,-1,1", "go,0,1") + ",go,9,1\n")
+    with pytest.raises(InputError, match="no end is a failure"):
+        read_log(path, on_bad="skip", end_reward=-3)
 
 
 def test_auto_needs_a_model(tmp_path):

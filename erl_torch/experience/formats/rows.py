@@ -190,7 +190,7 @@ class Rows:
         source, roles: what is read; episodes stand together (``in_order``).
         states, actions: their numbers.
         prior_policy: [S, A], behind a'; None: a' is 0 where it is not recorded.
-        on_prior: a' is the action of the next row, where that follows.
+        on_prior: a' is the action of the next row, where that follows: it is in s', and not behind a truncated end.
         seed: of a' where it is drawn.
         stride: of ``step`` from row to row; 0: it tells nothing.
         ends: what is added to the rewards of the steps that terminate an episode; None: nothing.
@@ -352,7 +352,9 @@ class Rows:
         # What was drawn, or taken, at the end of an episode was so in another state than s'.
         a_next = np.where(now.terminated, -1, now.a_next)
         if self._on_prior:
-            a_next = np.where((~ends | now.terminated) & (then.a >= 0), then.a, a_next)
+            # Behind a gap the next row is in another state; s' of a truncated end is in no row.
+            follows = (~ends | now.terminated) & (s_next == then.s)
+            a_next = np.where(follows & (then.a >= 0), then.a, a_next)
         return self._tuples(now, s_next, a_next, last | out | at_limit, strict)
 
     def _tuples(self, now: Block, s_next: np.ndarray, a_next: np.ndarray, out: np.ndarray, strict: bool) -> Batch:
