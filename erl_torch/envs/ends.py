@@ -10,7 +10,7 @@ from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.envs.encoded import encoded
 from erl_torch.mdp.ends import EndRule, Rule, with_end_reward
-from erl_torch.mdp.from_gymnasium import best_end, model_ends, rule_of_ends
+from erl_torch.mdp.from_gymnasium import end_pays, model_ends, rule_of_ends
 
 
 class EndReward(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
@@ -32,9 +32,9 @@ class EndReward(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs
     def __init__(self, env: gym.Env[Any, Any], end_reward: float, failures: Rule = "default") -> None:
         gym.utils.RecordConstructorArgs.__init__(self, end_reward=end_reward, failures=failures)
         super().__init__(env := encoded(env))
-        rule, best = rule_of_ends(failures, env), best_end(env)
+        rule = rule_of_ends(failures, env)
         self.rule = EndRule(rule, checks.finite("end_reward", end_reward))
-        if best is not None:  # then the environment tells of all its ends
+        if end_pays(env) is not None:  # then the environment tells of all its ends
             ends = model_ends(env, failures)
             with_end_reward(0.0 * ends.ended, ends.ended, ends.failed, end_reward)
         if end_reward < 0 and rule.limit == -float("inf") and not rule.states:
