@@ -205,7 +205,7 @@ def row(records: list[dict[str, Any]]) -> dict[str, Any]:
 def page(records: list[dict[str, Any]], command: str) -> tuple[str, dict[str, Any]]:
     """(the page, its figures)."""
     wrong = [[r["number"], *r["wrong"]] for r in records if r["wrong"]]
-    figures = {
+    figures: dict[str, Any] = {
         "command": command, "problems": len(records), "wrong": wrong,
         "by optimism": {f"{x:g}": row([r for r in records if r["optimism"] == x]) for x in OPTIMISMS},
         "by kind": {kind: row([r for r in records if r["kind"] == kind]) for kind in KINDS},

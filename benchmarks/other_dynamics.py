@@ -115,8 +115,8 @@ def coverage(n: int, n_tuples: int, seed: int, to: Path) -> list[dict[str, Any]]
     for k, (name, x) in enumerate(exact):
         inside, z, of_kish, width = np.array([record["found"][k] for record in known[:n]], float).T
         rows.append({
-            "case": name, "max w": float(ratios[name].max()), "optimism": x, "n": len(inside), "covered": float(inside.mean()),
-            "symmetric": float((np.abs(z) <= T95).mean()), "sd z": float(z.std()),
+            "case": name, "max w": float(ratios[name].max()), "optimism": x, "n": len(inside),
+            "covered": float(inside.mean()), "symmetric": float((np.abs(z) <= T95).mean()), "sd z": float(z.std()),
             "kish": float((np.abs(of_kish) <= T95).mean()), "kish sd z": float(of_kish.std()),
             "width": float(width.mean()),
         })  # fmt: skip
@@ -159,10 +159,10 @@ def page(rows: list[dict[str, Any]], shifts: list[dict[str, Any]], command: str,
         "",
         f"    {command}",
         "",
-        f"**Intervals.** {rows[0]['n']} datasets of {n_tuples:,} tuples of one random problem (8 states, 3 actions, beta",
-        "2; normal noise of .1 in the rewards), weighted by p^/p, against the exact theta* under p^. *Covered*: the 95%",
-        "interval of `theta_uncertainty`; *sandwich* and *Kish*: value -+ 1.96 standard errors, with the sandwich or",
-        "with Kish's effective sample size in place of n; sd z: of (estimate - exact) / standard error, 1 if it is right.",
+        f"**Intervals.** {rows[0]['n']} datasets of {n_tuples:,} tuples of one random problem (8 states, 3 actions,",
+        "beta 2; normal noise of .1 in the rewards), weighted by p^/p, against the exact theta* under p^. *Covered*: the",
+        "95% interval of `theta_uncertainty`; *sandwich* and *Kish*: value -+ 1.96 standard errors, with the sandwich",
+        "or with Kish's effective sample size in place of n; sd z: of (estimate - exact) / error, 1 if right.",
         "",
         "| case | largest w | optimism | covered | sandwich | sd z | Kish | sd z | mean width |",
         "|---" * 9 + "|",
@@ -174,9 +174,9 @@ def page(rows: list[dict[str, Any]], shifts: list[dict[str, Any]], command: str,
         )
     lines += [
         "",
-        '**The shift of Figure 4**: the motor for "up" breaks (beta 15), learnt from tuples of the time before alone (the',
-        "prior acts). Loss: g* - J in the new dynamics, reward a step. *Target*: the new dynamics are given. *Weights*:",
-        'only their ratio to the old; of a use of "up" in a hundred that failed, each counts some hundred-fold.',
+        '**The shift of Figure 4**: the motor for "up" breaks (beta 15), learnt from tuples of the time before alone',
+        "(the prior acts). Loss: g* - J in the new dynamics, reward a step. *Target*: the new dynamics are given.",
+        '*Weights*: only their ratio to the old. One use of "up" in a hundred failed; each counts a hundredfold.',
         "",
         "| up works with | tuples | exact theta | loss of the old policy | target: theta, loss | weights: certainty "
         "equivalence, loss | EfficientS1, loss | interval |",

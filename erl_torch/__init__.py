@@ -18,6 +18,7 @@ _PUBLIC = {
     "checks": "InputError",
     "empirical.counts": "EmpiricalMDP empirical_mdp",
     "empirical.dynamics": "for_dynamics reweighted",
+    "empirical.informative": "collect_informative informative_policy",
     "empirical.uncertainty": "Estimate bootstrap_theta policy_uncertainty theta_uncertainty",
     "envs.estimate": "EstimatedModel estimate_mdp",
     "evaluation": "Evaluation evaluate",

@@ -5,6 +5,8 @@ from erl_torch.empirical.counts import EmpiricalMDP as EmpiricalMDP
 from erl_torch.empirical.counts import empirical_mdp as empirical_mdp
 from erl_torch.empirical.dynamics import for_dynamics as for_dynamics
 from erl_torch.empirical.dynamics import reweighted as reweighted
+from erl_torch.empirical.informative import collect_informative as collect_informative
+from erl_torch.empirical.informative import informative_policy as informative_policy
 from erl_torch.empirical.uncertainty import Estimate as Estimate
 from erl_torch.empirical.uncertainty import bootstrap_theta as bootstrap_theta
 from erl_torch.empirical.uncertainty import policy_uncertainty as policy_uncertainty

@@ -289,6 +289,9 @@ class _Grid:
         if self.n > MOST:
             return  # refused by the caller, once it is known how many there are in all
         self.size = np.array(size, np.int64)
+        # Compared with, as a difference from ``low`` may leave the range of int64.
+        last = (int(x) + n - 1 for x, n in zip(self.low.tolist(), size, strict=True))
+        self.last = np.array([min(x, checks.LARGEST_INTEGER) for x in last], np.int64)
         self.strides = np.array([math.prod(size[i + 1 :]) for i in range(len(size))], np.int64)
 
     def encode(self, value: object) -> int:
@@ -299,10 +302,10 @@ class _Grid:
         return int(self._encode(value, self.shape).reshape(-1) @ self.strides)
 
     def encode_batch(self, values: object, n: int) -> np.ndarray:
-        return np.asarray(self._encode(values, (n, *self.shape)).reshape(n, -1) @ self.strides)
+        return np.asarray(self._encode(values, (n, *self.shape)) @ self.strides)
 
     def _encode(self, value: object, shape: tuple[int, ...]) -> np.ndarray:
-        """Entries from 0, [*shape] int64."""
+        """Entries from 0, [values, entries of one] int64."""
         try:
             array = np.asarray(value)
         except (ValueError, TypeError, RuntimeError) as error:
@@ -311,13 +314,13 @@ class _Grid:
             raise _Outside(f"not an array of shape {array.shape}" if array.ndim else "", value)
         if array.dtype.kind not in "iufb":
             raise _Outside(f"not {type(value).__name__}", value)
-        entries = array.reshape(-1, len(self.low))
+        entries = array.reshape(math.prod(shape[: len(shape) - len(self.shape)]), len(self.low))
         if array.dtype.kind == "f":
             good = np.isfinite(entries) & (entries == np.floor(entries)) & (abs(entries) < 2**63)
         else:
             good = entries <= checks.LARGEST_INTEGER
         whole = np.where(good, entries, 0).astype(np.int64)
-        good &= (whole >= self.low) & (whole - self.low < self.size)
+        good &= (whole >= self.low) & (whole <= self.last)
         if not good.all():
             row = int(np.argmin(good.all(1)))
             raise _Outside("", array[row] if array.ndim > len(self.shape) else value, row)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -19,6 +20,7 @@ MAX_PX = 400  # TensorBoard's image cards are about this wide
 # Those of Okabe and Ito, which any colour vision tells apart, and three more.
 COLOURS = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#222222", "#7b3294", "#8c6d31", "#9a9a9a"]
 MARKERS = "os^"
+LETTERS = 24  # of a label, at most
 MOST_ROWS, MOST_COLUMNS = 30, 12  # of a table whose rows or columns are named
 
 
@@ -31,8 +33,8 @@ def table_picture(
     """
     figure = Figure(figsize=(max_px / DPI, max_px / DPI), dpi=DPI)
     states, actions = names
-    rows = [] if states is None or len(states) > MOST_ROWS else [_brief(x) for x in states.texts.tolist()]
-    columns = [] if actions is None or len(actions) > MOST_COLUMNS else [_brief(x) for x in actions.texts.tolist()]
+    rows = [] if states is None or len(states) > MOST_ROWS else brief(states.texts.tolist())
+    columns = [] if actions is None or len(actions) > MOST_COLUMNS else brief(actions.texts.tolist())
     # 7 points of type are about 5 pixels a letter.
     left = 0.13 + 5 / max_px * max(map(len, rows), default=0)
     slanted = sum(map(len, columns)) * 6 > (0.78 - left) * max_px
@@ -51,10 +53,29 @@ def table_picture(
     return pixels(figure)
 
 
-def _brief(label: str) -> str:
-    """A label on one line, at most 24 letters long, that matplotlib takes for no formula."""
-    line = " ".join(label.split())
-    return (line if len(line) <= 24 else f"{line[:23]}\u2026").replace("$", r"\$")
+def brief(labels: Sequence[str]) -> list[str]:
+    """Labels on one line each, at most 24 letters long and as different as they were, that matplotlib takes for no
+    formula: cut at their ends, else in their middles, else without what all begin and end with, else after numbers."""
+    lines = [" ".join(label.split()) for label in labels]
+    both = (lines, [line[::-1] for line in lines])
+    head, tail = (len(os.path.commonprefix(x)) for x in both)  # noqa: RUF071  of texts
+    shortest = min(map(len, lines), default=0)
+    inner = [line[head : len(line) - min(tail, shortest - head)] for line in lines]
+    ways = (
+        [_cut(line, LETTERS - 1) for line in lines],
+        [_cut(line, LETTERS // 2) for line in lines],
+        [_cut(f"\u2026{line}\u2026", LETTERS - 1) for line in inner],
+        [_cut(f"\u2026{line}\u2026", LETTERS // 2) for line in inner],
+    )
+    numbered = [_cut(f"{i}: {line}", LETTERS - 1) for i, line in enumerate(lines)]
+    found = next((way for way in ways if len(set(way)) == len(set(labels))), numbered)
+    return [line.replace("$", r"\$") for line in found]
+
+
+def _cut(line: str, first: int) -> str:
+    """Its ``first`` letters and the last, ``LETTERS`` in all, where it is longer."""
+    last = LETTERS - 1 - first
+    return line if len(line) <= LETTERS else f"{line[:first]}\u2026{line[len(line) - last :]}"
 
 
 def learning_curves(sizes: Sequence[int], curves: Mapping[str, Sequence[Mapping[str, Any]]], title: str) -> np.ndarray:
@@ -81,7 +102,7 @@ def learning_curves(sizes: Sequence[int], curves: Mapping[str, Sequence[Mapping[
             # An interval that reaches 0 has no lower end on this axis: it is cut at a third of the lowest point.
             axes.fill_between(at, np.maximum(low, min(y) / 3), high, color=colour, alpha=0.18, linewidth=0, zorder=2)
         ends.append((y[-1], name, colour))
-    _plain(axes, "tuples of experience", "gap  g* \u2212 J,  reward a step")
+    plain(axes, "tuples of experience", "gap  g* \u2212 J,  reward a step")
     axes.set_xlim(sizes[0] / 1.15 if len(sizes) > 1 else sizes[0] / 2, sizes[-1])
     figure.text(0.095, 0.945, title, fontsize=11, weight="bold")
     figure.text(0.095, 0.908, "interquartile mean over seeds, 95 % band", fontsize=8.5, color="#666666")
@@ -129,7 +150,7 @@ def bands(
             axes.set_xscale("log")
         if not markers:
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-        _plain(axes, x_label, label)
+        plain(axes, x_label, label)
         if len(lines) > 1 and axes is all_axes[0]:
             axes.legend(fontsize=7, frameon=False)
     return pixels(figure)
@@ -154,7 +175,8 @@ def _panels(n: int, title: str, caption: str, card: bool) -> tuple[Figure, list[
     return figure, panels
 
 
-def _plain(axes: Axes, x_label: str, y_label: str) -> None:
+def plain(axes: Axes, x_label: str, y_label: str) -> None:
+    """Labels, a grid, and no frame at the top and on the right."""
     axes.grid(True, which="major", color="#dddddd", linewidth=0.8, zorder=0)
     axes.set_axisbelow(True)
     for side in ("top", "right"):

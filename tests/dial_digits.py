@@ -18,6 +18,7 @@ OPTIMISMS = (3.0, 1.0, 0.5, 0.0, -0.5, -1.0, -3.0, -10.0)
 KINDS = ("dense", "sparse", "periodic", "deterministic", "nearly closed")
 DIGITS = (60, 150, 400)
 SHARP = mpf(10) ** -25  # width of the bounds on g, relative to the rewards
+FAR = mpf(10) ** 30  # of a value
 STEPS = 60
 
 
@@ -170,7 +171,7 @@ class Oracle:
                 break
             step = relative_value(at.rows, dict(enumerate(at.gain)))[1]
             new = [x + step[s] for s, x in enumerate(value)]
-            if max(abs(x) for x in new) > mpf(10) ** 60:  # a policy that all but never leaves a bad set
+            if max(abs(x) for x in new) > FAR**2:  # a policy that all but never leaves a bad set
                 break
             value = [x - new[0] for x in new]
         return Answer(low, high, value, False)
@@ -196,7 +197,8 @@ class Oracle:
         """(what the agent can secure, what nature can hold it to), of the game behind optimism < 0: g* is in between.
 
         Policy iteration for each side against the other's fixed reply. It knows distributions, what nature pays for
-        them, KL(q || p)/|kappa|, and the linear equations of (pi, q), but no certainty equivalent.
+        them, KL(q || p)/|kappa|, and the linear equations of (pi, q), but no certainty equivalent. Infinite where a
+        reply all but closes a set of states, so that values run away.
         """
         self._at(DIGITS[0])
         policy, q = self.prior, self.p
@@ -205,6 +207,8 @@ class Oracle:
             least = mp.inf
             for _ in range(STEPS):
                 g, value = self._rate(policy, q)
+                if max(abs(x) for x in value.values()) > FAR:
+                    return -mp.inf, mp.inf
                 q = self._reply(value)
                 if least - g <= SHARP:
                     break
@@ -216,6 +220,8 @@ class Oracle:
         most = -mp.inf
         for _ in range(STEPS):
             g, value = self._rate(policy, q)
+            if max(abs(x) for x in value.values()) > FAR:
+                return secured, mp.inf
             policy = self._best(q, value)
             if g - most <= SHARP:
                 break

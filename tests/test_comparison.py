@@ -1,17 +1,29 @@
 """The comparison of learners: figures against direct evaluation, same bits for any number of processes."""
 
 import json
+import warnings
 from functools import partial
 
+import gymnasium as gym
 import numpy as np
 import oracle
 import pytest
 from helpers import composed, random_mdp, random_policy
 from matplotlib.image import imread
 
-from erl_torch import AlgorithmS1, InputError, TabularMDP, collect, pictures, solve_soft_bellman
+from erl_torch import (
+    AlgorithmS1,
+    InputError,
+    TabularMDP,
+    collect,
+    pictures,
+    smallest_charge,
+    solve_soft_bellman,
+    tabular_mdp,
+)
 from erl_torch.cli import main as cli
 from erl_torch.learners import LEARNERS, DifferentialSoftQ, SoftQ
+from erl_torch.mdp.from_gymnasium import model_ends
 from erl_torch.run.compare import MEASURES, compare, interquartile_mean, iqm_interval, run_comparison
 from erl_torch.solvers.optimum import measure, solve_optimum
 from erl_torch.solvers.policy import objective
@@ -220,6 +232,31 @@ def test_settings_of_one_learner_and_of_all(tmp_path):
     assert result["seeds"] == [5, 6]
     assert result["table"]["soft_q"]["n_steps"]["mean"] == 4000
     assert result["table"]["differential_soft_q"]["n_steps"]["mean"] == 30_000
+
+
+def test_the_charge_is_that_of_the_prior(tmp_path):
+    """end_reward=auto: the smallest charge under the prior that is compared with, given for all or in settings."""
+    env = gym.make("FrozenLake-v1")
+    prior = np.full((16, 4), 0.1)
+    prior[:, 1] = 0.7
+    np.save(tmp_path / "p.npy", prior)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found = smallest_charge(tabular_mdp(env), model_ends(env).failed, 5.0, 0.01, prior)
+    few = (
+        "env=frozen_lake",
+        "env.end_reward=auto",
+        "env.end_target=0.01",
+        "learners=[s1_efficient]",
+        "seeds=1",
+        "n_sizes=1",
+    )
+    for i, of_all in enumerate(("", "learner.s1_efficient.")):
+        result = run_comparison(
+            compared(*SMALL, *few, f"{of_all}beta=5", f"{of_all}prior_policy={tmp_path}/p.npy"), tmp_path / str(i)
+        )
+        assert result["theta"] == pytest.approx(found.solution.theta, rel=1e-9)
+        assert any(f"{-found.charge:.9g}" in one for one in result["notes"])
 
 
 def test_every_learner_can_be_compared():

@@ -257,7 +257,7 @@ def test_one_action_is_an_eigenvalue(optimism):
 
 
 def test_the_slope_at_0_is_priced_by_the_solution_there():
-    """d theta / d optimism = -(beta^2/2) E Var V / ... from both sides, and continuously so."""
+    """d theta / d optimism = -(beta/2) E Var V there, from both sides."""
     beta = 10.0
     at = solve_soft_bellman(CLIFF, beta, tol=1e-13)
     value, p = at.value.numpy(), CLIFF.transition.toarray().reshape(15, 4, 15)

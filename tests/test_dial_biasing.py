@@ -16,7 +16,7 @@ def many_digits(number, seed=1):
     return TabularMDP(given.transition, given.reward), given, optimism, Oracle(given, optimism).solve()
 
 
-@pytest.mark.parametrize("number", range(40))
+@pytest.mark.parametrize("number", [*range(0, 40, 5), 24, 27])
 def test_bounds_and_roots_in_many_digits(number):
     """theta_bounds of each iteration, and the side of theta* that -G(V) is on."""
     mdp, given, optimism, answer = many_digits(number)
@@ -29,7 +29,7 @@ def test_bounds_and_roots_in_many_digits(number):
             assert np.sign(1 - optimism) * (float(theta) - state.theta) >= -1e-9 * (1 + np.ptp(state.value))
 
 
-@pytest.mark.parametrize("number", [n for n in range(40) if OPTIMISMS[n % len(OPTIMISMS)] < 0])
+@pytest.mark.parametrize("number", [n for n in range(16) if OPTIMISMS[n % len(OPTIMISMS)] < 0])
 def test_the_game_has_that_value(number):
     """Below optimism 0, what the agent can secure and what nature can hold it to meet where TV = V + g says."""
     _, given, optimism, answer = many_digits(number)
@@ -39,7 +39,7 @@ def test_the_game_has_that_value(number):
 
 
 @pytest.mark.parametrize("optimism", [o for o in OPTIMISMS if abs(o) < 5])
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(2))
 def test_iterations_are_the_dense_ones(seed, optimism):
     """Value, theta, policy, and KL of the optimal dynamics to q_V, of the first iterations."""
     _, dense = random_problem(seed, optimism)
@@ -59,7 +59,7 @@ def test_iterations_are_the_dense_ones(seed, optimism):
 
 
 @pytest.mark.parametrize("optimism", [3.0, 1.0, 0.5, -0.5, -1.0, -3.0])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_both_routes_agree(seed, optimism):
     _, dense = random_problem(seed, optimism)
     mdp = TabularMDP(dense.p, dense.r)
@@ -81,8 +81,8 @@ def test_one_iteration_at_optimism_1():
     assert solve_biasing(mdp, 2.0, optimism=1.0).n_steps == 1
 
 
-@pytest.mark.parametrize("optimism", [-30.0, -100.0, -1000.0, 100.0])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("optimism", [-30.0, -1000.0, 100.0])
+@pytest.mark.parametrize("seed", range(2))
 def test_far_ends_of_the_dial(seed, optimism):
     """|kappa| span V up to thousands, with full support: theta is between those of the best and the worst successor."""
     _, dense = random_problem(seed, optimism, dense=True)

@@ -16,6 +16,7 @@ from erl_torch import (
     CertaintyEquivalence,
     EfficientS1,
     EvaluationSettings,
+    ListedS1,
     Replicas,
     Simulation,
     Status,
@@ -29,13 +30,12 @@ from erl_torch import (
 )
 from erl_torch.checks import InputError
 from erl_torch.empirical.counts import joint
+from erl_torch.learners import Exact
 from erl_torch.learners.action_value.q_learning import ULearning
 from erl_torch.learners.efficient_s1 import kernels
 from erl_torch.run.compare import compare
 from erl_torch.run.judge import of_data
 from erl_torch.solvers.policy import objective
-
-OPTIMISM = (2.0, 1.0, 0.3, -0.5, -2.0)
 
 
 def noisy(data, rng, scale):
@@ -77,15 +77,16 @@ def of_tuples(data, shape, beta, optimism, together):
 # -- what is learnt ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("together", [False, True])
-@pytest.mark.parametrize("optimism", OPTIMISM)
+@pytest.mark.parametrize(
+    ("optimism", "together"), [(2.0, False), (1.0, True), (0.3, False), (-0.5, False), (-2.0, True)]
+)
 def test_both_learners_solve_the_problem_of_the_tuples(optimism, together):
     rng = np.random.default_rng(7)
     data = noisy(random_stream(rng, random_mdp(rng, 4, 2), 2000), rng, 0.2)
     theta, policy = of_tuples(data, (4, 2), 3.0, optimism, together)
     noise = "joint" if together else "mean"
-    exact = CertaintyEquivalence(3.0, optimism, reward_noise=noise).fit(data, 4, 2)
-    learnt = EfficientS1(3.0, optimism, reward_noise=noise).fit(data, 4, 2)
+    exact = CertaintyEquivalence(3.0, optimism=optimism, reward_noise=noise).fit(data, 4, 2)
+    learnt = EfficientS1(3.0, optimism=optimism, reward_noise=noise).fit(data, 4, 2)
     for found, tol in ((exact, 1e-9), (learnt, 1e-5)):
         assert found.status is Status.CONVERGED
         assert found.optimism == optimism
@@ -98,7 +99,7 @@ def test_the_paper_s_delta_at_any_optimism(optimism):
     """(1 - lam) (C_lam V - C_(lam-1) V), of the rows of the counts."""
     rng = np.random.default_rng(1)
     data = random_stream(rng, random_mdp(rng, 4, 2), 2000)
-    found = EfficientS1(2.0, optimism).fit(data, 4, 2)
+    found = EfficientS1(2.0, optimism=optimism).fit(data, 4, 2)
     p, value = empirical_mdp(data, 4, 2).transition.toarray(), -found.log_psi.numpy() / 2.0
 
     def certain(lam):
@@ -110,11 +111,25 @@ def test_the_paper_s_delta_at_any_optimism(optimism):
     np.testing.assert_allclose(found.reward_bias.numpy().ravel(), delta, atol=1e-5)
 
 
+@pytest.mark.parametrize("log_domain", ["off", "on"])
+@pytest.mark.parametrize("optimism", [1.0, -0.5])
+def test_with_every_option_off_it_is_algorithm_s1(optimism, log_domain):
+    """Two implementations of the listing at any optimism."""
+    rng = np.random.default_rng(0)
+    data = random_stream(rng, random_mdp(rng, 4, 3), 500)
+    options = dict(beta=2.0, optimism=optimism, lr_u=0.05, lr_psi=0.1, n_epochs=2, n_bias=3)
+    paper = ListedS1(**options).fit(data, 4, 3)
+    ours = EfficientS1.published(**options, log_domain=log_domain).fit(data, 4, 3)
+    assert ours.theta == pytest.approx(paper.theta, rel=1e-12)
+    for name in ("policy", "u", "psi", "reward_bias"):
+        np.testing.assert_allclose(getattr(ours, name), getattr(paper, name), rtol=1e-10, atol=1e-14)
+
+
 @pytest.mark.parametrize(
     "options",
     [
         dict(expected_backup=False),
-        dict(sample_mean_psi=False),
+        dict(sample_mean_psi=False, lr_psi=0.002),
         dict(mean_reward=False),
         dict(log_domain="on"),
         dict(unvisited="initial"),
@@ -124,20 +139,20 @@ def test_the_paper_s_delta_at_any_optimism(optimism):
 def test_options_hold_at_any_optimism(options):
     """What streams e as it comes is noisy, and near; the others end at the certificate."""
     rng = np.random.default_rng(3)
-    data = random_stream(rng, random_mdp(rng, 4, 2), 20_000)
-    theta = CertaintyEquivalence(2.0, -1.0).fit(data, 4, 2).theta
-    found = EfficientS1(2.0, -1.0, clock_floor=0.001, n_bias=10, **options).fit(data, 4, 2)
+    data = random_stream(rng, random_mdp(rng, 4, 2), 10_000)
+    theta = CertaintyEquivalence(2.0, optimism=-1.0).fit(data, 4, 2).theta
+    found = EfficientS1(2.0, optimism=-1.0, clock_floor=0.001, n_bias=8, **options).fit(data, 4, 2)
     assert found.theta == pytest.approx(theta, abs=0.01)
 
 
 def test_online_it_is_certified_however_the_stream_is_cut():
     rng = np.random.default_rng(5)
-    data = random_stream(rng, random_mdp(rng, 5, 3), 30_000)
-    theta = CertaintyEquivalence(4.0, -1.5).fit(data, 5, 3).theta
+    data = random_stream(rng, random_mdp(rng, 5, 3), 10_000)
+    theta = CertaintyEquivalence(4.0, optimism=-1.5).fit(data, 5, 3).theta
     ends = []
-    for cut in (30_000, 7001):
-        chunks = [data.where(slice(i, i + cut)) for i in range(0, 30_000, cut)]
-        *_, state = EfficientS1(4.0, -1.5).online(chunks, 5, 3)
+    for cut in (10_000, 3001):
+        chunks = [data.where(slice(i, i + cut)) for i in range(0, 10_000, cut)]
+        *_, state = EfficientS1(4.0, optimism=-1.5).online(chunks, 5, 3)
         assert state.certified
         assert state.theta == pytest.approx(theta, abs=state.empirical_width)
         ends.append(state)
@@ -145,7 +160,7 @@ def test_online_it_is_certified_however_the_stream_is_cut():
         np.testing.assert_array_equal(getattr(ends[0], name), getattr(ends[1], name))
 
 
-@hypothesis.settings(max_examples=20, deadline=None)
+@hypothesis.settings(max_examples=6, deadline=None)
 @hypothesis.given(problem=problems(), kappa=st.floats(-6, 6), average=st.booleans(), factors=st.booleans())
 def test_kernels_back_up_the_tilted_mean(problem, kappa, average, factors):
     """The loop as it is written in the module's docstring, tuple by tuple."""
@@ -204,7 +219,7 @@ def test_arguments_are_named():
     for optimism in (np.nan, np.inf, "1"):
         for learner in (CertaintyEquivalence, EfficientS1, erl_torch.learners.Exact):
             with pytest.raises(InputError, match="optimism="):
-                learner(5.0, optimism)
+                learner(5.0, optimism=optimism)
     with pytest.raises(InputError, match=r"reward_noise=.*mean.*joint"):
         CertaintyEquivalence(reward_noise="both")
     for off in ("sample_mean_psi", "mean_reward"):
@@ -231,8 +246,9 @@ def solved(p, reward, beta, optimism, policy=None):
     return rate(backup, len(reward))[1]
 
 
-@pytest.mark.parametrize("of_policy", [False, True])
-@pytest.mark.parametrize("optimism", [2.0, 1.0, 0.0, -0.5, -2.0])
+@pytest.mark.parametrize(
+    ("optimism", "of_policy"), [(2.0, False), (1.0, True), (0.0, False), (-2.0, False), (-2.0, True)]
+)
 def test_error_and_bias_are_those_of_derivatives_taken_by_differences(optimism, of_policy):
     """J along the draws of each pair: the slopes' variance, and half the mean of the curvatures, over n."""
     rng = np.random.default_rng(11)
@@ -282,12 +298,12 @@ def test_no_single_rate_has_no_interval():
     p[0, 0, 0] = p[0, 1, 1] = 1.0
     p[1, :] = 0.5
     data = collect(TabularMDP(p, np.array([[1.0, 1.0], [0.0, 0.0]]), np.array([1.0, 0.0])), 1, 20_000, 0)
-    found = CertaintyEquivalence(10.0, -0.3).fit(data, 2, 2)
+    found = CertaintyEquivalence(10.0, optimism=-0.3).fit(data, 2, 2)
     assert found.status is Status.NO_SINGLE_RATE
     assert found.theta is None
     estimate = theta_uncertainty(empirical_mdp(data, 2, 2), 10.0, optimism=-0.3)
     assert "no single rate" in estimate.withheld
-    assert EfficientS1(10.0, -0.3).fit(data, 2, 2).status is Status.UNCERTIFIED
+    assert EfficientS1(10.0, optimism=-0.3).fit(data, 2, 2).status is Status.UNCERTIFIED
 
 
 def test_intervals_of_rewards_that_count_together_are_withheld():
@@ -308,7 +324,7 @@ def windy(rng):
     return random_mdp(rng, 5, 3)
 
 
-@pytest.mark.parametrize("learner", [CertaintyEquivalence(4.0, 1.0), EfficientS1(4.0, -1.0)])
+@pytest.mark.parametrize("learner", [CertaintyEquivalence(4.0, optimism=1.0), EfficientS1(4.0, optimism=-1.0)])
 def test_a_run_is_held_against_the_optimum_of_its_optimism(tmp_path, learner):
     mdp = windy(np.random.default_rng(2))
     data = collect(mdp, 10, 1000, 0)
@@ -334,7 +350,7 @@ def test_a_run_is_held_against_the_optimum_of_its_optimism(tmp_path, learner):
 
 def test_replicas_of_several_optimisms_have_an_optimum_each(tmp_path):
     mdp = windy(np.random.default_rng(3))
-    learners = [EfficientS1(3.0, lam) for lam in (1.0, 0.0, -1.0) for _ in range(2)]
+    learners = [EfficientS1(3.0, optimism=lam) for lam in (1.0, 0.0, -1.0) for _ in range(2)]
     replicas = Replicas(tuple(learners))
     streams = Simulation(mdp, n_episodes=3, episode_length=1000, seeds=[0, 1] * 3)
     erl_torch.train(replicas, mdp, streams, directory=tmp_path, evaluation=QUICK)
@@ -360,9 +376,21 @@ def test_a_learner_without_a_choice_says_so(tmp_path):
     assert not any("dial" in note for note in notes)
 
 
+@pytest.mark.parametrize("method", ["biasing", "soft_bellman"])
+def test_the_exact_solver_as_a_learner(method):
+    mdp = windy(np.random.default_rng(6))
+    learner = Exact(3.0, optimism=-0.5, method=method)
+    *_, state = learner.iterate(mdp)
+    best = solve_soft_bellman(mdp, 3.0, optimism=-0.5)
+    for found in (learner.solve(mdp), learner.solution(state)):
+        assert found.optimism == -0.5
+        assert found.theta == pytest.approx(best.theta, abs=1e-8)
+        np.testing.assert_allclose(found.policy, best.policy, atol=1e-6)
+
+
 def test_a_comparison_is_of_one_optimism():
     mdp = windy(np.random.default_rng(5))
-    learners = {"ce": CertaintyEquivalence(3.0, 1.0), "s1": EfficientS1(3.0, 1.0)}
+    learners = {"ce": CertaintyEquivalence(3.0, optimism=1.0), "s1": EfficientS1(3.0, optimism=1.0)}
     found = compare(mdp, learners, 5, 1000, seeds=2)
     assert found.theta == pytest.approx(solve_soft_bellman(mdp, 3.0, optimism=1.0).theta, abs=1e-9)
     assert found.measures["gap"].max() < 0.01

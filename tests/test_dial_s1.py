@@ -8,14 +8,15 @@ import numpy as np
 import oracle
 import pytest
 import torch
-from helpers import problems, random_mdp, random_policy, random_stream
+from helpers import composed, problems, random_mdp, random_policy, random_stream, scalars
 from hypothesis import strategies as st
 
-from erl_torch import AlgorithmS1, InputError, ListedS1, Replicas, Status, Transitions, collect
+from erl_torch import AlgorithmS1, InputError, ListedS1, Replicas, Solution, Status, Transitions, collect
 from erl_torch.empirical.counts import tally
 from erl_torch.experience.simulation import Simulation
 from erl_torch.learners.s1 import kernels
 from erl_torch.learners.s1.algorithm import gains, gauge, line_12, reward_biases
+from erl_torch.run.training import train
 
 DIAL = (3.0, 1.0, 0.5, 0.0, -0.5, -1.0, -3.0)
 IMPLEMENTATIONS = ("fast", "literal")
@@ -95,7 +96,7 @@ def test_expected_lines_reach_the_exact_solution(seed, optimism):
     mdp, prior, p = small(seed)
     beta, shape = 3.0, mdp.reward.shape
     theta, policy, value = value_iteration(p, mdp.reward, prior, beta, optimism)
-    learner = AlgorithmS1(beta, optimism, prior_policy=prior)
+    learner = AlgorithmS1(beta, optimism=optimism, prior_policy=prior)
     csr = mdp.transition.indptr.astype(np.int64), mdp.transition.indices.astype(np.int32), mdp.transition.data
     psi, log_psi_of = np.ones(4), []
     for _ in range(12):
@@ -115,6 +116,8 @@ def test_expected_lines_reach_the_exact_solution(seed, optimism):
     weight = prior * u
     assert found == pytest.approx(theta, abs=1e-12)
     np.testing.assert_allclose(weight / weight.sum(1, keepdims=True), policy, atol=1e-11)
+    C = [certainty_equivalent(p, value, beta * x) for x in (optimism, optimism - 1)]
+    np.testing.assert_allclose(delta, (1 - optimism) * (C[0] - C[1]), atol=1e-10)
     learnt = -log_psi_of[-1] / beta
     np.testing.assert_allclose(learnt - learnt[0], value - value[0], atol=1e-11)
 
@@ -140,7 +143,7 @@ def test_expected_update_vanishes_at_the_exact_iterations(implementation, optimi
     exact = exact_lines(p, mdp.reward, prior, 3.0, optimism, k + 1)[k]
     lr = 1e-7
     learner = AlgorithmS1(
-        3.0, optimism, lr, lr, n_epochs=5, n_bias=9, prior_policy=prior, implementation=implementation
+        3.0, lr, lr, optimism=optimism, n_epochs=5, n_bias=9, prior_policy=prior, implementation=implementation
     )  # fmt: skip
     tables = {"psi_in_use": "psi", "mean_psi": "mean_psi", "mean_log_psi": "mean_log_psi", "reward_bias": "delta"}
     state = replace(
@@ -165,7 +168,9 @@ def test_expected_update_vanishes_at_the_exact_iterations(implementation, optimi
 def test_streams_come_near_the_exact_solution(optimism):
     mdp, prior, p = small(2, 3, 2)
     data = collect(mdp, 1, 100_000, 0, prior_policy=prior)
-    found = AlgorithmS1(2.0, optimism, 0.002, lr_psi=0.002, n_epochs=8, n_bias=5, prior_policy=prior).fit(data, 3, 2)
+    found = AlgorithmS1(2.0, lr_u=0.002, optimism=optimism, lr_psi=0.002, n_epochs=8, n_bias=5, prior_policy=prior).fit(
+        data, 3, 2
+    )
     theta, policy, _ = value_iteration(p, mdp.reward, prior, 2.0, optimism)
     assert found.theta == pytest.approx(theta, abs=0.02)
     np.testing.assert_allclose(found.policy, policy, atol=0.02)
@@ -266,7 +271,7 @@ def test_optimism_1_is_plain_u_learning(kind, implementation):
     """Biasing iteration 0, again and again: b = 1, delta = 0, and no psi phase (whose means of 1 are 1 to rounding)."""
     mdp, _, _ = small(3)
     data = random_stream(np.random.default_rng(0), mdp, 500)
-    learner = kind(2.0, 1.0, 0.05, n_epochs=2, n_bias=3, implementation=implementation)
+    learner = kind(2.0, lr_u=0.05, optimism=1.0, n_epochs=2, n_bias=3, implementation=implementation)
     states = list(learner.iterate(data, 4, 3))
     first = list(replace(learner, optimism=0.0, n_bias=1).iterate(data, 4, 3))
     for state, other in zip(states, first, strict=False):
@@ -283,7 +288,7 @@ def test_optimism_1_is_the_listings_two_lines_without_biases(implementation):
     mdp, _, _ = small(3)
     data = random_stream(np.random.default_rng(0), mdp, 500)
     options = dict(n_epochs=1, n_bias=1, lr_rho=0.01, implementation=implementation)
-    found = ListedS1(2.0, 1.0, 0.05, **options).fit(data, 4, 3)
+    found = ListedS1(2.0, lr_u=0.05, optimism=1.0, **options).fit(data, 4, 3)
     expected = oracle.lines_9_to_11(data, (4, 3), 2.0, 0.05, 0.01, 1.0)
     assert found.rho == pytest.approx(expected.rho, rel=1e-12)
     np.testing.assert_allclose(found.u, expected.u / expected.u.mean(), rtol=1e-12)
@@ -296,7 +301,7 @@ def test_rewards_that_vary_count_jointly_at_optimism_1():
     data = Transitions(np.zeros(n, int), np.zeros(n, int), r, np.zeros(n, int), np.zeros(n, int))
     expected = -math.log(np.exp(beta * r).mean()) / beta
     for optimism in (1.0, -1.0):
-        found = ListedS1(beta, optimism, 0.01, lr_rho=0.002, n_epochs=20, n_bias=2).fit(data, 1, 1)
+        found = ListedS1(beta, lr_u=0.01, optimism=optimism, lr_rho=0.002, n_epochs=20, n_bias=2).fit(data, 1, 1)
         assert found.theta == pytest.approx(expected, abs=0.01)
 
 
@@ -314,7 +319,9 @@ def test_bad_optimism_is_named(value):
 def test_leaving_the_numbers_is_named(implementation, optimism):
     mdp, _, _ = small(3)
     data = random_stream(np.random.default_rng(0), mdp, 2000)
-    found = AlgorithmS1(5.0, optimism, 0.1, n_epochs=1, n_bias=3, implementation=implementation).fit(data, 4, 3)
+    found = AlgorithmS1(5.0, lr_u=0.1, optimism=optimism, n_epochs=1, n_bias=3, implementation=implementation).fit(
+        data, 4, 3
+    )
     assert found.status is Status.NON_FINITE
     assert "lower beta" in found.message
     assert torch.isfinite(found.policy).all()
@@ -343,13 +350,13 @@ def test_replicas_at_any_optimism_come_out_as_alone(source, layout):
     learner = AlgorithmS1(5.0, lr_u=0.1, n_epochs=2, n_bias=3, prior_policy=prior)
     replicas = Replicas.of(learner, optimism=SWEEP, threads=2, block=3, layout=layout)
     streams = [collect(mdp, 1, 2000, seed, prior_policy=prior) for seed in range(n)]
-    experience = streams
+    experience: object = streams
     if source in ("kept", "again"):
         experience = Simulation(mdp, 1, 2000, range(n), keep=source == "kept")
     elif source != "recorded":
         noise = 0.1 * rng.standard_normal(2000) if source == "noisy" else 0.0
-        experience = replace(streams[0], r=streams[0].r + noise)
-        streams = [experience] * n
+        shared = replace(streams[0], r=streams[0].r + noise)
+        experience, streams = shared, [shared] * n
     found = replicas.fit(experience, 4, 3)
     assert list(found.failures) == [n - 1]
     assert found.optimism.tolist() == list(SWEEP)
@@ -372,10 +379,62 @@ def test_torch_operations_are_the_compiled_loop():
 def test_goes_on_from_any_state_with_the_same_bits(optimism):
     mdp, _, _ = small(4)
     data = random_stream(np.random.default_rng(1), mdp, 500)
-    learner = AlgorithmS1(3.0, optimism, 0.05, n_epochs=2, n_bias=3)
+    learner = AlgorithmS1(3.0, lr_u=0.05, optimism=optimism, n_epochs=2, n_bias=3)
     states = list(learner.iterate(data, 4, 3))
     for state in states[:-1]:
         last = list(learner.iterate(data, 4, 3, state))[-1]
         assert last.rho == states[-1].rho
         assert torch.equal(last.u, states[-1].u)
         assert torch.equal(last.mean_log_psi, states[-1].mean_log_psi)
+
+
+# -- runs --------------------------------------------------------------------------------------------------------
+
+
+class Killed(BaseException):
+    """As SIGKILL."""
+
+
+def run_and_go_on(cfg, directory):
+    """The result of a run that was killed after its third epoch and gone on with; "whole" beside "cut"."""
+    train(cfg, directory / "whole")
+    left = [3 + (2 if cfg.n_replicas == 1 else 0)]  # safe points while tuples are collected
+
+    def safe_point():
+        left[0] -= 1
+        if not left[0]:
+            raise Killed
+
+    with pytest.raises(Killed):
+        train(cfg, directory / "cut", safe_point)
+    assert any((directory / "cut/checkpoints").iterdir())
+    result = train(cfg, directory / "cut")
+    assert scalars(directory / "cut") == scalars(directory / "whole")
+    return result
+
+
+SHORT = (
+    "experience.n_episodes=3", "evaluation.n_episodes=2", "evaluation.horizon=50", "checkpoint_every=0",
+    "evaluation.pictures=false", "learner.n_epochs=2", "learner.n_bias=3",
+)  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("learner", ["s1", "s1_listing"])
+def test_the_command_line_sweeps_optimism_and_goes_on_with_the_same_bits(tmp_path, learner):
+    values = [1.5, 1, 0.5, 0.1, 0, -0.1, -0.5]
+    cfg = composed("n_replicas=2", f"+vary.optimism={values}", f"learner={learner}", *SHORT)
+    result = run_and_go_on(cfg, tmp_path)
+    assert [group["settings"] for group in result["groups"]] == [{"optimism": value} for value in values]
+    assert [group["optimism"] for group in result["groups"]] == values
+    files = [(tmp_path / name / "replicas.npz").read_bytes() for name in ("whole", "cut")]
+    assert files[0] == files[1]
+
+
+@pytest.mark.parametrize("optimism", [1.0, -0.5])
+def test_a_single_run_goes_on_with_the_same_bits(tmp_path, optimism):
+    result = run_and_go_on(composed("learner=s1", f"learner.optimism={optimism}", *SHORT), tmp_path)
+    assert result["optimism"] == optimism
+    files = [(tmp_path / name / "solution.npz").read_bytes() for name in ("whole", "cut")]
+    assert files[0] == files[1]
+    assert Solution.load(tmp_path / "whole/solution.npz").optimism == optimism

@@ -40,6 +40,51 @@ def test_which_ends_fail_by_default():
 
 
 @pytest.mark.parametrize(
+    ("ends", "going_on", "failed"),
+    [
+        ([-7, -8, -10], [-1, -3, -4], [True, True, True]),  # a breakdown that costs a little less is no success
+        ([-7, -7], [-1, -3], [True, True]),
+        ([-1, -5], [-1, -1, -1], [False, True]),  # a goal, and a pit, where each step costs 1
+        ([-0.1, -5], [-0.1] * 30, [False, True]),  # a mean that rounds
+        ([0, -5], [-1, -1], [False, True]),
+        ([2, -5], [3, 3], [False, True]),  # what pays is a success
+        ([-1, -1], [-1, -40], [False, False]),
+    ],
+)
+def test_the_best_of_bad_ends_is_no_success(ends, going_on, failed):
+    """In a log, and in a table: one state, whose actions end or go on."""
+    reward = np.array(ends + going_on, float)
+    over = np.arange(len(reward)) < len(ends)
+    assert failing_ends(reward, over, np.zeros(len(reward), int), 1)[over].tolist() == failed
+    env = Lottery(reward, over)
+    assert model_ends(env).failed[0, over].tolist() == failed
+    if any(failed):
+        charged = EndReward(env, -1.0)
+        for a, fails in enumerate(failed):
+            charged.reset()
+            assert charged.step(a)[1] == reward[a] - fails
+
+
+class Lottery(gym.Env):
+    """One state: action a pays reward[a], and ends the episode or not."""
+
+    observation_space = gym.spaces.Discrete(1)
+    model_holds = True
+
+    def __init__(self, reward, over):
+        self.action_space = gym.spaces.Discrete(len(reward))
+        self.P = {0: {a: [(1.0, 0, float(r), bool(end))] for a, (r, end) in enumerate(zip(reward, over, strict=True))}}
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return 0, {}
+
+    def step(self, action):
+        (_, s, r, end), = self.P[0][int(action)]  # fmt: skip
+        return s, r, end, False, {}
+
+
+@pytest.mark.parametrize(
     ("rule", "best", "text"),
     [
         ("default", None, "failures=default: must be unpaid, all, none, or a list of states"),
@@ -120,6 +165,19 @@ def test_steps_of_an_environment_that_does_not_tell():
     for end_reward, rule in ((-1.0, "none"), (1.0, "all")):
         with pytest.raises(InputError, match=f"end_reward={end_reward}"):
             EndReward(env, end_reward, rule)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "end_reward", "failures"),
+    [("CliffWalking-v1", -5.0, "default"), ("CliffWalking-v1", 5.0, "unpaid"), ("FrozenLake-v1", -1.0, [0])],
+)
+def test_what_no_end_gets_is_refused_from_steps_as_of_the_model(env_id, end_reward, failures):
+    said = []
+    for make in (EndReward, lambda env, x, rule: tabular_mdp(env, end_reward=x, failures=rule)):
+        with pytest.raises(InputError, match=f"end_reward={end_reward}: must be 0, or a") as error:
+            make(gym.make(env_id), end_reward, failures)
+        said.append(str(error.value))
+    assert said[0] == said[1]
 
 
 def test_ends_of_a_windy_lake():
@@ -247,6 +305,43 @@ def test_targets_that_no_policy_meets_are_said():
     for target in (0.0, 1.0, -1.0):
         with pytest.raises(InputError, match="target="):
             smallest_charge(mdp, failing, 10.0, target)
+
+
+def test_a_charge_scales_with_the_rewards_and_is_found_where_there_are_none():
+    """c(k r, beta/k) = k c(r, beta), at r = 0 too."""
+    rng = np.random.default_rng(9)
+    mdp, failing = random_mdp(rng, 4, 3), rng.random((4, 3))
+    for reward in (mdp.reward, np.zeros((4, 3))):
+        one = TabularMDP(mdp.transition, reward, mdp.start)
+        target = 0.8 * smallest_charge(one, failing, 2.0, 1 - 1e-9).failing_rate
+        charge = smallest_charge(one, failing, 2.0, target).charge
+        assert charge > 0
+        larger = TabularMDP(mdp.transition, 50 * reward, mdp.start)
+        assert smallest_charge(larger, failing, 2.0 / 50, target).charge == pytest.approx(50 * charge, rel=1e-6)
+
+
+def test_charges_where_actions_are_missing():
+    """A missing action, against a copy of another that shares its prior."""
+    rng = np.random.default_rng(10)
+    mdp, failing = random_mdp(rng, 3, 3), rng.random((3, 3))
+    p = mdp.transition.toarray().reshape(3, 3, 3)
+    copied, paid, fails, prior = p.copy(), mdp.reward.copy(), failing.copy(), np.full((3, 3), 1 / 3)
+    copied[0, 2], paid[0, 2], fails[0, 2], prior[0] = p[0, 0], paid[0, 0], failing[0, 0], [0.25, 0.5, 0.25]
+    reward = mdp.reward.copy()
+    reward[0, 2] = -np.inf
+    mdp, twin = TabularMDP(p, reward, mdp.start), TabularMDP(copied, paid, mdp.start)
+    failing[0, 2] = 0.0
+    free = smallest_charge(mdp, failing, 3.0, 1 - 1e-9)
+    target = 0.9 * free.failing_rate
+    charge = smallest_charge(mdp, failing, 3.0, target).charge
+    assert charge > 0
+    assert charge == pytest.approx(smallest_charge(twin, fails, 3.0, target, prior).charge, rel=1e-6)
+    said = []
+    for one, chance, own in ((mdp, failing, None), (twin, fails, prior)):
+        with pytest.raises(InputError, match="every policy fails at that rate") as error:
+            smallest_charge(one, chance, 3.0, 1e-3, own)
+        said.append(float(str(error.value).split("at least ")[1].split(":")[0]))
+    assert said[0] == pytest.approx(said[1], rel=2e-2)
 
 
 def test_the_charge_of_a_log():

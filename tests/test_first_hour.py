@@ -158,6 +158,7 @@ def test_arguments_that_are_keys_of_every_environment_are_given_apart(typed_here
         ("env=broken:Ring", f"broken failed (AttributeError: {ABSENT}, broken.py, line 2)"),
         ("env=broken:Ring-v0", f"that can be imported: broken failed (AttributeError: {ABSENT}"),
         ("env=not_there:Ring-v0", "there is no module not_there"),
+        ("env=not_there:Ring", "env=not_there:Ring: must be"),
         ("learner.class=shop", "learner.class=shop: must be the dotted name of a class"),
     ],
 )  # fmt: skip
@@ -413,6 +414,8 @@ def estimate(value, sd):
     [
         ([1.0] * 20, solution(1.0), estimate(1.01, 0.02), "Yes, as far as the data can tell"),
         ([1.0] * 20, solution(1.0), estimate(1.1, 0.02), "It has settled, but outside"),
+        ([1.0] * 20, solution(1.0, (0.5, 0.6)), estimate(1.01, 0.02), "but not at theta*: the data contradict"),
+        ([1.0] * 20, solution(1.0, (0.9, 0.95)), estimate(1.01, 0.02), "Yes, as far as the data can tell"),
         ([*[1.0] * 19, 1.2], solution(1.2), estimate(1.2, 0.02), "Not settled"),
         ([1.0] * 20, solution(1.0), None, "Whether at theta*, no data tell"),
         ([1.0], solution(1.0, (0.9999, 1.0001)), None, "Yes: theta is inside its proven bounds"),

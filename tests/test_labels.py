@@ -114,6 +114,13 @@ def test_labels_come_back_from_their_texts(tmp_path_factory, values):
         assert labels.text(labels.encode(value)) == again.text(again.encode(value))
 
 
+def test_a_text_that_is_written_otherwise_stays_a_text():
+    texts = ["3.0", "True", "1_0", "0x1f", "(1,2)", "3", "(1, 2)"]
+    labels = Labels.of_texts(texts)
+    assert labels.texts.tolist() == texts
+    assert [*labels] == [*texts[:5], 3, (1, 2)]
+
+
 def test_order_is_that_of_first_appearance_and_equal_texts_are_one_label():
     labels = Labels.of_values(["b", 3, "a", "3", np.int64(3), 3.0, (1, "x"), [1, "x"], np.array([1, 2])])
     assert list(labels) == ["b", 3, "a", (1, "x"), (1, 2)]
@@ -140,6 +147,8 @@ def test_the_first_wrong_row_of_a_column_is_named(column):
     labels = Labels.of_values(["b"])
     with pytest.raises(InputError, match=r"^state\[1\]=a: must be one of b"):
         labels.encode_all(column, "state")
+    with pytest.raises(InputError, match=r"^state\[0\]=z: must be one of b"):
+        labels.encode_all(np.array(["z", "a"]), "state")  # the first in place, not in value
 
 
 def test_whole_numbers_are_taken_from_floats_and_nothing_else_is():
@@ -174,6 +183,38 @@ def test_the_place_in_a_batch_is_named():
     labels = Labels.of_space(spaces.MultiDiscrete([2, 3]))
     with pytest.raises(InputError, match=r"^observation\[2\]=\[1 3\]"):
         labels.encode_batch(np.array([[0, 0], [1, 2], [1, 3]]), 3, "observation")
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        spaces.Discrete(3, start=-5),
+        spaces.MultiDiscrete([3, 3], start=[-2, -2]),
+        spaces.Box(-3, -1, (2,), np.int64),
+        spaces.Box(-(2**63), -(2**63) + 2, (1,), np.int64),
+    ],
+)
+@pytest.mark.parametrize("kind", [np.int8, np.int64, np.uint8, np.uint32, np.uint64])
+def test_numbers_far_outside_a_space_are_refused(space, kind):
+    """Differences from a lowest entry below 0 leave the range of int64; 2**64 - 1 as an int64 is -1."""
+    labels = Labels.of_space(space)
+    extremes = {int(np.iinfo(kind).max), int(np.iinfo(kind).max) - 1, int(np.iinfo(kind).max) // 2 + 1}
+    if np.iinfo(kind).min == -128:
+        extremes.add(-128)
+    for value in extremes:
+        wrong = np.full(np.shape(labels.decode(0)), value, kind)
+        with pytest.raises(InputError, match=r"^label="):
+            labels.encode(wrong)
+        with pytest.raises(InputError, match=r"^label\[0\]="):
+            labels.encode_batch(wrong[None], 1)
+    for number in range(len(labels)):
+        assert labels.encode(labels.member(number)) == number
+
+
+def test_a_space_of_one_member_without_entries():
+    labels = Labels.of_space(spaces.Box(0, 2, (0,), np.int64))
+    assert (len(labels), labels.encode(np.zeros(0, np.int64)), labels.decode(0)) == (1, 0, ())
+    assert labels.encode_batch(np.zeros((3, 0), np.int64), 3).tolist() == [0, 0, 0]
 
 
 @pytest.mark.parametrize(

@@ -48,9 +48,13 @@ def by_hand(text):
     """[(s, a, r, s')] of the shop's log, by the rules that docs/logs.md states."""
     rows = [dict(zip(NAMES, line, strict=True)) for line in list(csv.reader(io.StringIO(text)))[1:]]
     found = []
+    first = {row["customer"]: int(row["week"]) for row in reversed(rows)}
+    watched = max(int(row["week"]) - first[row["customer"]] for row in rows)
     for i, row in enumerate(rows):
         following = rows[i + 1] if i + 1 < len(rows) else rows[0]
         same = i + 1 < len(rows) and following["customer"] == row["customer"]
+        if row["left"] == "yes" and int(row["week"]) - first[row["customer"]] == watched:
+            continue  # at the time limit, where all others are cut
         if row["left"] == "yes":
             s_next = following["segment"]
         elif row["unwatched"] == "yes" or not same or int(following["week"]) != int(row["week"]) + 1:
@@ -152,7 +156,7 @@ def test_the_report_counts(tmp_path):
     assert (report.rows, report.tuples, report.states, report.actions) == (len(rows), len(tuples), 4, 3)
     assert (report.episodes, report.terminated, report.truncated) == (len(customers), len(left), len(unwatched))
     assert report.cut == len(customers - left - unwatched)
-    assert report.rows == report.tuples + report.bad + report.last + report.before_gaps
+    assert report.rows == report.tuples + report.bad + report.last + report.before_gaps + report.at_limit
     steps = [int(b["week"]) - int(a["week"]) for a, b in pairwise(rows) if a["customer"] == b["customer"]]
     assert report.gaps == sum(step != 1 for step in steps)
     assert (report.pairs, report.pairs_never_seen) == (len(pairs), 2)
@@ -174,14 +178,24 @@ def test_the_report_counts(tmp_path):
 
 
 def reference(rows, s_next, episode, terminated, truncated, step):
-    """[(s, a, r, s')] of rows (dicts) where the columns named are there: one row at a time."""
-    found = []
+    """[(s, a, r, s')] of rows (dicts) where the columns named are there: one row at a time.
+
+    Where two or more episodes are cut at the last of all places, what terminates there is left out.
+    """
+    found, first, lasts = [], 0, []
+    ending = []  # places in ``found`` of rows that terminate, with their place in the episode
     for i, row in enumerate(rows):
+        place = row["step"] - rows[first]["step"] if step and not s_next else i - first
         after = rows[i + 1] if i + 1 < len(rows) else None
         end = after is None or (episode and after["episode"] != row["episode"])
         end = end or (terminated and row["terminated"]) or (truncated and row["truncated"])
+        cut = end and not s_next and not (terminated and row["terminated"])
+        if end:
+            lasts.append((place, cut))
+            first = i + 1
         if terminated and row["terminated"]:
             to = (after or rows[0])["s"]
+            ending.append((len(found), place))
         elif s_next:
             to = row["s_next"]
         elif end or (step and after["step"] != row["step"] + 1):
@@ -189,9 +203,14 @@ def reference(rows, s_next, episode, terminated, truncated, step):
         else:
             to = after["s"]
         found.append((row["s"], row["a"], row["r"], to))
-    return found
+    limit = max(place for place, _ in lasts)
+    if lasts.count((limit, True)) > 1:
+        for at in [at for at, place in ending if place == limit]:
+            found[at] = None
+    return [one for one in found if one]
 
 
+@pytest.mark.filterwarnings("ignore:ends are too frequent:erl_torch.Note")
 @pytest.mark.parametrize("seed", range(40))
 def test_random_logs(seed):
     rng = np.random.default_rng(seed)
@@ -213,10 +232,111 @@ def test_random_logs(seed):
     frame = {name: [row[name] for row in rows] for name in names}
     log = read_log(frame)
     assert named(log) == reference(rows, **there)
+    report, after = log.report, [*rows[1:], None]
+    ends = [
+        b is None
+        or any(there[x] and a[x] for x in ("terminated", "truncated"))
+        or (there["episode"] and a["episode"] != b["episode"])
+        for a, b in zip(rows, after, strict=True)
+    ]
+    if there["episode"] or there["terminated"] or there["truncated"]:
+        terminated = sum(there["terminated"] and row["terminated"] for row in rows)
+        truncated = sum(
+            there["truncated"] and row["truncated"] for row in rows if not (there["terminated"] and row["terminated"])
+        )
+        assert (report.episodes, report.terminated, report.truncated) == (sum(ends), terminated, truncated)
+        assert report.cut == sum(ends) - terminated - truncated >= 0
+    if there["s_next"]:
+        assert report.gaps == sum(a["s_next"] != b["s"] for a, b, end in zip(rows, after, ends, strict=True) if not end)
+    frame["r"] = [None if rng.random() < 0.1 else r for r in frame["r"]]
+    spoilt = read_log(frame, on_bad="skip").report
+    assert spoilt.tuples + spoilt.bad + spoilt.last + spoilt.before_gaps == spoilt.rows
+    frame["r"] = [row["r"] for row in rows]
     for chunk in (1, 7):
         pieces = read_log(frame, chunk=chunk)
         assert isinstance(pieces.experience, FileRecording)
         assert pieces.experience.checksum() == log.experience.checksum()
+
+
+BUSY = np.array([[0.6, 0.2], [0.7, 0.3]])  # the chance of busy after (calm, busy) x (push, rest)
+BREAKS = np.array([[0, 0], [0.15, 0.02]])  # that the step ends the episode
+WAGES = np.array([[2.0, 0.0], [4.0, 1.0]])
+
+
+def cut_log(limits, seed):
+    """(columns without a state after, that column): an episode for each of ``limits``, the most rows it may have."""
+    rng, n = np.random.default_rng(seed), len(limits)
+    s, live, found = np.zeros(n, int), np.ones(n, bool), []
+    for t in range(limits.max()):
+        a = rng.integers(2, size=n)
+        ends, to = rng.random(n) < BREAKS[s, a], (rng.random(n) < BUSY[s, a]).astype(int)
+        live &= t < limits
+        found.append(np.stack([np.arange(n), np.full(n, t), s, a, WAGES[s, a], ends, to])[:, live])
+        live, s = live & ~ends, to
+    joined = np.concatenate(found, 1)
+    columns = joined[:, np.lexsort((joined[1], joined[0]))].T
+    frame = dict(zip(("episode", "step", "s", "a", "r", "terminated"), columns.T[:6], strict=True))
+    return frame, columns.T[6]
+
+
+def true_theta(charge):
+    """-J* by the average-reward soft Bellman equation at beta 1, iterated in numpy."""
+    to_busy = (1 - BREAKS) * BUSY
+    p = np.stack([1 - to_busy, to_busy], 2)
+    v = np.zeros(2)
+    for _ in range(500):
+        v, before = np.log(np.exp(WAGES + charge * BREAKS + p @ (v - v[0])).mean(1)), v - v[0]
+    return -(v - before)[0]
+
+
+def test_the_mean_of_large_rewards():
+    frame = dict(s=[0, 1, 0, 1], a=[0] * 4, r=[1.5e308, 1.5e308, 1.5e308, -1.5e308], terminated=[0, 0, 0, 1])
+    assert read_log(frame).report.mean_reward == pytest.approx(0.75e308, rel=1e-12)
+
+
+@pytest.mark.parametrize(("limit", "step"), [(3, True), (6, False)])
+def test_a_time_limit_selects_no_ends(limit, step):
+    """Rows that are cut are left out, so those that end in the same place must be: else ends are too frequent."""
+    frame, _ = cut_log(np.full(20_000, limit), 0)
+    if not step:
+        del frame["step"]
+    log = read_log(frame, end_reward=-10, failures="all")  # no note: they would be errors
+    assert log.report.at_limit == sum(
+        ended and place == limit - 1 for ended, place in zip(frame["terminated"], cut_places(frame), strict=True)
+    )
+    solution = CertaintyEquivalence(1.0).fit(log.experience, 2, 2)
+    estimate = erl_torch.theta_uncertainty(erl_torch.empirical_mdp(log.experience, 2, 2), 1.0)
+    low, high = estimate.interval(1 - 1e-6)
+    assert low < true_theta(-10) < high
+    assert high - low < 0.3
+    assert low < solution.theta < high
+    pieces = read_log(frame, end_reward=-10, failures="all", chunk=1000)
+    assert pieces.experience.checksum() == log.experience.checksum()
+    given = read_experience(frame, 2, 2)  # of a problem that is known
+    assert np.array_equal(given.s, log.experience.s)
+    assert np.array_equal(given.s_next, log.experience.s_next)
+
+
+def cut_places(frame):
+    """Of each row in its episode."""
+    first = np.append(True, np.diff(frame["episode"]) != 0)
+    return np.arange(len(first)) - np.flatnonzero(first)[np.cumsum(first) - 1]
+
+
+def test_cuts_in_many_places_are_noted():
+    """The excess of ends that the note tells, against the ends that cut rows would have had."""
+    limits = np.random.default_rng(1).integers(1, 5, 20_000)
+    frame, s_next = cut_log(limits, 2)
+    with pytest.warns(erl_torch.Note, match="A column s_next, the state after, mends it") as caught:
+        log = read_log(frame)
+    share = float(re.search(r"by about (\S+) of their number", str(caught[0].message))[1])
+    pairs = list(zip(frame["s"], frame["a"], strict=True))
+    busy = np.array([s == 1 for s, _ in pairs])
+    rate = np.array(frame["terminated"])[busy].mean()  # all rows: no selection
+    kept = sum(s == "1" for s, *_ in named(log))
+    ends = frame["terminated"].sum() - log.report.at_limit
+    assert ends / (kept - ends) / (rate / (1 - rate)) - 1 == pytest.approx(share, abs=0.05)
+    read_log(frame | {"s_next": s_next})  # no note
 
 
 def test_episodes_that_are_mixed_are_put_together():
@@ -439,6 +559,75 @@ def test_types_are_judged_by_the_column_not_its_first_batch(tmp_path):
     assert len(log.experience) == n + 1
 
 
+@pytest.mark.parametrize("given", [False, True])
+def test_a_next_of_a_log_made_with_the_prior_has_the_chances_of_its_state(given):
+    """Prior rows differ by state; a row's action tells where it was drawn. In between, behind ends, and behind gaps."""
+    rng = np.random.default_rng(3)
+    n = 20_000
+    prior = np.array([[0.999, 0.001], [0.001, 0.999]])
+    truncated, gap = (rng.random(n) < 0.2 for _ in range(2))
+    terminated = (rng.random(n) < 0.2) & ~truncated
+    gap &= ~terminated & ~truncated
+    s = rng.integers(2, size=n)
+    a = (rng.random(n) < prior[s, 1]).astype(int)
+    s_next = np.where(gap | terminated | truncated, 1 - np.roll(s, -1), np.roll(s, -1))
+    frame = dict(s=s, a=a, r=np.ones(n), s_next=s_next, terminated=terminated, truncated=truncated)
+    if given:  # at an end, what was drawn in the state where the episode ended
+        frame["a_next"] = np.where(terminated, 1 - np.roll(s, -1), (rng.random(n) < prior[s_next, 1]).astype(int))
+    log = read_log(frame, prior_policy=prior, on_prior=not given)
+    data = log.experience
+    assert len(data.s) == n
+    assert log.report.gaps == gap[:-1].sum()
+    assert np.array_equal(data.s_next, np.where(terminated, np.roll(s, -1), s_next))
+    inside = ~(gap | terminated | truncated)
+    for rows in (inside, truncated, terminated, gap):
+        for state in range(2):
+            drawn = data.a_next[rows & (data.s_next.astype(int) == state)]
+            deviation = np.sqrt(0.001 * 0.999 / len(drawn))
+            assert abs(drawn.mean() - prior[state, 1]) < 5 * deviation + 1 / len(drawn)
+    if not given:
+        assert np.array_equal(data.a_next[:-1][inside[:-1]], a[1:][inside[:-1]])
+
+
+def test_a_next_that_the_prior_lacks_is_drawn():
+    rng = np.random.default_rng(4)
+    prior = np.array([[0.5, 0.5, 0.0], [0.0, 0.5, 0.5]])
+    s, s_next = rng.integers(2, size=(2, 4000))
+    a = np.where(s == 0, rng.integers(2, size=4000), 1 + rng.integers(2, size=4000))
+    frame = dict(s=s, a=a, r=np.ones(4000), s_next=s_next, a_next=rng.integers(3, size=4000))
+    data = read_log(frame, prior_policy=prior).experience
+    assert len(data.s) == 4000
+    has = prior[s_next, frame["a_next"]] > 0
+    assert np.array_equal(data.a_next[has], frame["a_next"][has])
+    assert (prior[data.s_next, data.a_next] > 0).all()
+    again = data.a_next[~has & (s_next == 0)]
+    assert abs(again.mean() - 0.5) < 5 * 0.5 / np.sqrt(len(again))
+
+
+def test_an_episode_that_is_not_told():
+    """Nothing is known of a row without its episode: neither what it leads to, nor what led to it."""
+    rows = [{"s": i % 3, "a": 0, "r": float(i), "episode": 0, "step": i, "terminated": False} for i in range(8)]
+    rows[3]["episode"] = None
+    frame = pa.Table.from_pylist(rows)
+    with pytest.raises(InputError, match=r"episode\[3\]=missing: must be there"):
+        read_log(frame)
+    log = read_log(frame, on_bad="skip")
+    assert log.experience.r.tolist() == [0, 1, 4, 5, 6]
+    assert (log.report.bad, log.report.first_bad) == (1, "episode[3]=missing")
+    nowhere = frame.set_column(3, "episode", pa.nulls(8, pa.int64()))
+    with pytest.raises(InputError, match=r"episode\[0\]=missing: must be there"):
+        read_log(nowhere)
+
+
+def test_steps_that_go_down_without_a_column_of_episodes_are_gaps():
+    """An episode may have been cut there, and another one begun."""
+    frame = dict(s=[0, 1, 2, 0, 1, 2], a=[0] * 6, r=[0.0, 1, 2, 3, 4, 5], step=[0, 1, 2, 0, 1, 2],
+                 terminated=[False] * 5 + [True])  # fmt: skip
+    log = read_log(frame)
+    assert log.experience.r.tolist() == [0, 1, 3, 4, 5]
+    assert log.report.before_gaps == 1
+
+
 # -- hostile files -----------------------------------------------------------------------------------------------
 
 
@@ -459,7 +648,21 @@ def test_types_are_judged_by_the_column_not_its_first_batch(tmp_path):
         ("flag.csv", b"s,a,r,done\n0,0,1,maybe\n", r"terminated\[0\] \(done\)=maybe: must be true or false"),
         ("noflag.csv", b"s,a,r,done\n0,0,1,\n", r"terminated\[0\] \(done\)=missing: must be true or false"),
         ("lost.csv", b"s,a,r,done\nx,0,1,0\n,0,1,1\n", r"s\[1\]=missing: must be one of x"),
-        ("down.csv", b"episode,t,s,a,r\n1,3,0,0,1\n1,2,1,0,1\n1,1,0,0,1\n", "t=steps of -1: must be in order of time"),
+        (
+            "nul.csv",
+            b"s,a,r,done\nx,0,1,0\ny\0,0,1,1\n",
+            r"nul.csv: s='y.x00': must be a text without the character NUL",
+        ),
+        (
+            "down.csv",
+            b"episode,t,s,a,r\n1,3,0,0,1\n1,2,1,0,1\n1,1,0,0,1\n",
+            r"t\[1\]=2: must be at least 3, that of the row before: steps of an episode are in order of time",
+        ),
+        (
+            "mixed.csv",
+            b"episode,t,s,a,r\n0,0,0,0,1\n0,2,1,0,1\n0,1,0,0,1\n0,3,0,0,1\n",
+            r"t\[2\]=1: must be at least 2",
+        ),
         ("latin.csv", "s,a,r,done\né,0,1,1\n".encode("latin-1"), "must be a readable CSV file"),
         (
             "cut.csv.gz",
@@ -658,6 +861,11 @@ def test_a_log_resumes_sweeps_and_varies(tmp_path, shop, typed_here):
             ("experience.columns.s=colour",),
             "experience.columns.s=colour: must be a column of shop.csv; the columns are",
         ),
+        (
+            ("experience.columns.s=null",),
+            "experience.path=shop.csv: s=missing: must be a column named s, state, states, obs, observation, "
+            "observations, or any other: experience.columns.s=NAME; the columns are",
+        ),
         (("experience.on_bad=stop",), r"experience.path=shop.csv: r\["),
         (("learner.prior_policy=p.npy",), "learner.prior_policy=array of shape (2, 2): must be of shape [4, 3]"),
         (("env=windy_cliff",), "experience.path=shop.csv: s[0] (segment)=new: must be a whole number in [0, 15)"),
@@ -768,16 +976,22 @@ b,stay,0,1
 
 
 @pytest.mark.parametrize(
-    ("end_reward", "failures", "expected"),
+    ("end_reward", "failures", "expected", "said"),
     [
-        (-3, "default", [0, -4, 0, 2, 0.5, 0, -3]),  # ends that pay at most 0, as one pays 2
-        (-3, "all", [0, -4, 0, -1, 0.5, 0, -3]),
-        (5, "default", [0, -1, 0, 7, 0.5, 0, 0]),
-        (5, "none", [0, 4, 0, 7, 0.5, 0, 5]),
-        (0, "default", [0, -1, 0, 2, 0.5, 0, 0]),
+        # ends that pay at most 0, as one pays 2
+        (
+            -3,
+            "default",
+            [0, -4, 0, 2, 0.5, 0, -3],
+            "-3 at the ends that pay at most 0, 2 of 3; env.failures says which",
+        ),
+        (-3, "all", [0, -4, 0, -1, 0.5, 0, -3], "-3 at every end, 3 of 3"),
+        (5, "default", [0, -1, 0, 7, 0.5, 0, 0], "+5 at all but the ends that pay at most 0, 1 of 3; env.failures"),
+        (5, "none", [0, 4, 0, 7, 0.5, 0, 5], "+5 at every end, 3 of 3"),
+        (0, "default", [0, -1, 0, 2, 0.5, 0, 0], ""),
     ],
 )
-def test_ends_of_a_log_count(tmp_path, end_reward, failures, expected):
+def test_ends_of_a_log_count(tmp_path, capsys, end_reward, failures, expected, said):
     path = tmp_path / "log.csv"
     path.write_text(ENDS)
     log = read_log(path, end_reward=end_reward, failures=failures)
@@ -787,7 +1001,21 @@ def test_ends_of_a_log_count(tmp_path, end_reward, failures, expected):
         "experience=recorded", f"experience.path={path}", f"env.end_reward={end_reward}", f"env.failures={failures}",
         "learner=certainty_equivalence", "evaluation.pictures=false",
     )  # fmt: skip
-    assert train(cfg, tmp_path / "run")["n_experience"] == 7
+    result = train(cfg, tmp_path / "run")
+    assert result["n_experience"] == 7
+    assert (result["end_reward"] or "").startswith(said)
+    assert capsys.readouterr().out.count(f"end reward        {said}") == 2 * bool(said)  # in the report, and at the end
+
+
+def test_breakdowns_of_any_cost_are_charged():
+    """Where ends pay less than other steps do, that which pays most is no success."""
+    frame = dict(s=list("ababab"), a=[0, 0, 0, 1, 0, 0], r=[-1.0, -7, -1, -10, -1, -7], terminated=[0, 1, 0, 1, 0, 1])
+    log = read_log(frame, end_reward=-20)
+    assert log.experience.r.tolist() == [-1, -27, -1, -30, -1, -27]
+    assert "end reward        -20 at every end, 3 of 3" in str(log.report)
+    unlike = read_log(frame | {"r": [-7.0, -7, -7, -10, -7, -7]}, end_reward=-20)
+    assert unlike.experience.r.tolist() == [-7, -7, -7, -30, -7, -7]
+    assert "-20 at the ends that pay less than -7, 1 of 3; env.failures says which" in str(unlike.report)
 
 
 @pytest.mark.parametrize(
@@ -805,6 +1033,14 @@ def test_ends_that_nothing_counts_for(tmp_path, text, arguments, said):
     with pytest.raises(InputError) as caught:
         read_log(tmp_path / "log.csv", **arguments)
     assert said in str(caught.value)
+
+
+def test_the_end_of_a_bad_row_tells_nothing(tmp_path):
+    """The best end, beside which others fail, is that of the rows that count."""
+    path = tmp_path / "log.csv"
+    path.write_text(ENDS.replace("go,2,1", "go,0,1").replace("go,-1,1", "go,0,1") + ",go,9,1\n")
+    with pytest.raises(InputError, match="no end is a failure"):
+        read_log(path, on_bad="skip", end_reward=-3)
 
 
 def test_auto_needs_a_model(tmp_path):

@@ -1,5 +1,7 @@
 """Neighbours of the average reward (discounted, finite horizon, first exit): closed forms, an oracle of 40 digits."""
 
+import re
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -17,6 +19,9 @@ from erl_torch import (
     tabular_mdp,
 )
 from erl_torch.envs.windy_cliff import WindyCliffEnv
+from erl_torch.solvers.discounted import _over
+from erl_torch.solvers.first_exit import _certificate, _Inside
+from erl_torch.solvers.problem import BellmanProblem
 
 pytestmark = pytest.mark.filterwarnings("ignore::erl_torch.MeanRewardWarning")
 
@@ -173,8 +178,30 @@ def test_discounted_bounds_hold_in_forty_digits():
         own = oracle.worth(table_of(found.policy.numpy()))
         assert max(a - b for a, b in zip(exact, own, strict=True)) <= mpf(found.gap)
         size = np.abs(found.value.numpy()).max()
+        q = np.array([[float(x) for x in oracle.q(exact, s)] for s in range(n)])
+        assert np.abs(found.action_value.numpy() - q).max() <= 1e-9 * max(size, np.abs(q).max())
+        assert found.gap <= 2.5 * float((found.value_high - found.value_low).max())
         assert found.gap <= 1e-9 * size
         assert float((found.value_high - found.value_low).max()) <= 1e-10 * size * (1 + 1e-6)
+
+
+def test_quotients_are_rounded_outwards():
+    mp.dps = DIGITS
+    for x in np.random.default_rng(2).normal(size=200):
+        for discount in (0.1, 0.7, 1 - 1e-9):
+            low, high = _over(x, x, discount)
+            assert mpf(low) < mpf(float(x)) / (1 - mpf(discount)) < mpf(high)
+
+
+@pytest.mark.parametrize("order", [[0, 1, 2], [2, 1, 0], [1, 0, 2]])
+def test_a_state_that_is_hardly_ever_met_costs_no_digits(order):
+    """0 is left at once, and met with share 1e-12. Wherever it stands."""
+    p = np.array([[[0, 1, 0]] * 2, [[1e-12, 0.5, 0.5 - 1e-12]] * 2, [[0, 0.3, 0.7]] * 2])
+    r = np.array([[5.0, 1.0], [1.0, 2.0], [3.0, -1.0]])
+    mdp = TabularMDP(p[order][:, :, order], r[order], np.full(3, 1 / 3))
+    found = solve_discounted(mdp, 1.0, 1 - 1e-8)
+    assert found.status is Status.CONVERGED
+    assert float((found.value_high - found.value_low).max()) < 1e-9 * found.value.abs().max()
 
 
 @pytest.mark.parametrize("discount", [1.0, -0.1, np.nan, "0.9"])
@@ -226,6 +253,22 @@ def test_finite_horizon_bounds_hold_in_forty_digits():
         assert max(a - b for a, b in zip(exact, own, strict=True)) <= mpf(found.gap)
         size = max(np.abs(found.value.numpy()).max(), np.abs(mdp.reward).max())
         assert found.gap <= 1e-11 * size
+
+
+def test_the_gap_of_a_finite_horizon_is_of_all_states():
+    """State 0 is worth 0 for ever, without rounding; the policy of state 1 has an error of beta eps |V|."""
+    p = np.zeros((4, 2, 4))
+    p[0, :, 0] = p[2, :, 2] = p[3, :, 3] = 1
+    p[1, 0, 2] = p[1, 1, 3] = 1
+    mdp = TabularMDP(p, [[0.0, 0.0], [1 / 3, 0.1], [0.0, 0.0], [0.0, 0.0]], [0.25] * 4)
+    last = [0.0, 0.0, 1e6, 1e6 + 0.2333333]
+    beta = 1e6
+    found = solve_finite_horizon(mdp, beta, 1, last_value=last)
+    oracle = Exact(mdp, np.full((4, 2), 0.5), beta)
+    value = [mpf(x) for x in last]
+    exact, row, q = oracle.backup(value)[0], normalised(digits(found.policy[0].numpy())[1]), oracle.q(value, 1)
+    worth = mp.fsum(w * (q[a] - mp.log(2 * w) / mpf(beta)) for a, w in enumerate(row) if w)
+    assert 0 < exact[1] - worth <= mpf(found.gap)
 
 
 # -- first exit -------------------------------------------------------------------------------------------------------
@@ -292,6 +335,8 @@ def test_a_break_even_way_round_is_not_solved():
     found = solve_first_exit(loop(np.log(2)), 1.0)
     assert found.status is Status.STAGNATED
     assert "which rounding hides" in found.message
+    assert not found.solved.any()  # so that the policy is the prior
+    assert found.value[0].isnan()
     assert found.value_high[0].item() == np.inf
 
 
@@ -321,6 +366,52 @@ def test_a_model_without_an_end_is_refused():
     p = np.eye(2)[:, None]  # an end that is never met
     with pytest.raises(InputError, match=r"ends=\[\]: must be reached, for certain"):
         solve_first_exit(TabularMDP(p, [[-1.0], [0.0]], [1.0, 0.0]), 1.0)
+
+
+def test_rewards_that_carry_the_prior_left_out_are_between_their_bounds():
+    """r + log(1 - p_out)/beta, p_out the prior of the pairs that may lead to where no end can be reached."""
+    rng = np.random.default_rng(12)
+    mp.dps = DIGITS
+    p = np.zeros((3, 4, 3))
+    p[0, :3, 1] = p[0, 3, 2] = p[1, :, 1] = p[2, :, 2] = 1
+    for _ in range(200):
+        prior = np.full((3, 4), 0.25)
+        prior[0] = rng.dirichlet(10.0 ** rng.uniform(-1, 1, 4)) + 1e-12
+        prior[0] /= prior[0].sum()
+        beta, r = 10.0 ** rng.uniform(-2, 3), rng.normal(size=4) * 10.0 ** rng.uniform(-3, 1)
+        mdp = TabularMDP(p, np.vstack([r, np.zeros((2, 4))]), [1.0, 0, 0])
+        problem = BellmanProblem.of(mdp, beta, prior)
+        inside = _Inside.of(problem, problem.states == 1)
+        assert inside.names.tolist() == [0]
+        row = [mpf(float(x)) for x in problem.prior[0]]
+        left = mp.log(mp.fsum(row[:3]) / mp.fsum(row)) / mpf(beta)
+        for a in range(3):
+            assert mpf(inside.low[0, a]) < mpf(float(r[a])) + left < mpf(inside.high[0, a])
+
+
+def test_bounds_hold_whatever_value_and_steps_they_are_made_from():
+    mdp = random_mdp(np.random.default_rng(13), 5, 2, 1)
+    problem = BellmanProblem.of(mdp, 2.0)
+    inside = _Inside.of(problem, problem.states == 4)
+    found = solve_first_exit(mdp, 2.0)
+    exact, steps = np.append(found.value[:4], 0.0), np.append(found.steps[:4], 0.0)
+    for shift in (1.0, -1.0):
+        for share in (1.0, 0.1):
+            below, above, bound = _certificate(inside, exact + shift * (steps > 0), share * steps)
+            assert (below <= exact[:4] + 1e-9).all()
+            assert (above >= exact[:4] - 1e-9).all()
+            assert (bound >= steps[:4] - 1e-9).all()
+
+
+def test_the_rate_of_a_way_round_is_told():
+    """Staying alone: r + log(1/2)/beta."""
+    for beta, reward in ((1.0, 2.0), (5.0, 0.3), (0.5, 3.0)):
+        low, high = map(
+            float, re.search("rate of (.+) to ([^:]+): ", solve_first_exit(loop(reward), beta).message).groups()
+        )
+        rate = reward - np.log(2) / beta
+        assert low == pytest.approx(rate, rel=1e-5)
+        assert high == pytest.approx(rate, rel=1e-5)
 
 
 def test_an_end_at_the_start_is_worth_nothing():
@@ -491,6 +582,45 @@ def test_episodes_that_never_end():
     cliff = tabular_mdp(gym.make("CliffWalking-v1"), "absorb")
     assert (figures := evaluate_episodes(cliff, np.eye(4)[np.zeros(48, int)])).steps.low == np.inf
     assert (figures.mean_return.low, figures.mean_return.high) == (-np.inf, np.inf)
+
+
+def test_only_ends_are_successes_and_only_what_is_done_pays():
+    """0 goes to the end 1, or, with chance 1/2, to 2, which stays for ever; there another action would pay."""
+    p = np.zeros((3, 2, 3))
+    p[0, :, 1] = p[0, :, 2] = 0.5
+    p[1, :, 1] = p[2, :, 2] = 1
+    mdp = TabularMDP(p, [[-1.0, -1.0], [0, 0], [0, 7.0]], [1.0, 0, 0])
+    policy = [[1.0, 0.0]] * 3
+    ends = [False, True, False]
+    figures = evaluate_episodes(mdp, policy, ends, successes=[True, True, True])
+    assert figures == evaluate_episodes(mdp, policy, ends, successes=ends) == evaluate_episodes(mdp, policy, ends)
+    assert figures.mean_return.value == pytest.approx(-1.0)
+    assert figures.success_rate.value == pytest.approx(0.5)
+    assert figures.steps.value == np.inf
+    assert np.isnan(evaluate_episodes(mdp, [[0.5, 0.5]] * 3, ends).mean_return.value)
+
+
+def test_what_is_beyond_double_precision_is_no_number():
+    """60 steps forward in a row, with chance 1e-6 each, else back: 1e360 steps."""
+    n = 61
+    p = np.zeros((n, 1, n))
+    p[np.arange(n - 1), 0, np.arange(1, n)] = 1e-6
+    p[: n - 1, 0, 0] += 1 - 1e-6
+    p[-1, 0, -1] = 1
+    mdp = TabularMDP(p, np.append(-np.ones(n - 1), 0.0)[:, None], np.eye(n)[0])
+    figures = evaluate_episodes(mdp, np.ones((n, 1)))
+    for figure, low in zip(figures, (-np.inf, 0.0, 0.0), strict=True):
+        assert np.isnan(figure.value)
+        assert figure.low == low
+    assert (figures.mean_return.high, figures.success_rate.high, figures.steps.high) == (np.inf, 1.0, np.inf)
+    found = solve_first_exit(mdp, 1.0)
+    assert found.status is Status.STAGNATED
+    assert not found.solved.any()
+    assert found.value[:-1].isnan().all()
+    assert found.steps[:-1].isnan().all()
+    assert found.action_value[:-1].isnan().all()
+    assert (found.value_low[:-1] == -np.inf).all()
+    assert (found.value_high[:-1] == np.inf).all()
 
 
 # -- missing actions --------------------------------------------------------------------------------------------------

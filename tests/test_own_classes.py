@@ -174,7 +174,7 @@ def test_a_folder_of_configurations(tmp_path, typed_here):
         (["learner.class=my_package.Sweeps", "learner.n_epochs=1.5"], "learner.n_epochs=1.5: must be a whole number"),
         (["learner.class=my_package.Sweeps", "learner.rate=0"], "learner.rate=0.0: must be a number in (0, 1]"),
         (["env.class=my_package.Ring", "env.size=x"], "env.size=x: must be a whole number, in digits"),
-        (["env.class=my_package.Ring", "env.size=0"], "env.kwargs={'size': 0, 'slip': 0.1}: must be arguments of"),
+        (["env.class=my_package.Ring", "env.size=0"], "env.size=0 env.slip=0.1: must be arguments of"),
     ],
 )  # fmt: skip
 def test_bad_classes_and_settings_get_one_line(tmp_path, typed_here, arguments, expected):

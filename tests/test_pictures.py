@@ -23,6 +23,24 @@ def test_size_and_type(draw, grid):
     assert picture.std() > 5  # not blank
 
 
+@pytest.mark.parametrize(
+    "labels",
+    [
+        [str({"season": i, "stock": j}) for i in (0, 1) for j in range(5)],
+        ["a" * 30 + str(i) + "b" * 30 for i in range(3)],
+        [a + "m" * 40 + b + "n" * 40 + c for a in "ab" for b in "cd" for c in "ef"],
+        ["x" * 40, "x" * 41, "x" * 42, ""],
+        ["a$b" * 9, "short"],
+    ],
+)
+def test_labels_are_cut_where_they_are_alike(labels):
+    """None longer than 24 letters, as many different ones as there were; a short one is left as it is."""
+    found = pictures.brief(labels)
+    assert len(found) == len(set(found)) == len(labels)
+    assert max(len(text.replace("\\$", "$")) for text in found) <= 24
+    assert pictures.brief(["go", "stay $"]) == ["go", r"stay \$"]
+
+
 def blue(picture):
     r, g, b = np.moveaxis(picture.astype(int), -1, 0)
     return (b - r > 60) & (g < 120)

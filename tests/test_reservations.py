@@ -14,6 +14,8 @@ import erl_torch
 from erl_torch import NonFiniteError, TabularMDP, Transitions, collect
 from erl_torch.empirical.counts import empirical_mdp, tally
 from erl_torch.empirical.reservations import (
+    ADVICE,
+    CONTRADICTED,
     FAR_HALF_WIDTHS,
     Reservation,
     _covered,
@@ -303,6 +305,11 @@ def test_theta_far_from_the_data_is_counted_in_half_widths():
     for sign in (1, -1):
         (found,) = of_theta(1 + sign * 1.01 * FAR_HALF_WIDTHS * half, rewards, estimate)
         assert f"is {1.01 * FAR_HALF_WIDTHS:.3g} {FAR_OFF}, theta = 1.000 +- 0.020" in found.text
+    # Of data that the proof contradicts, the learnt theta on its side or on theirs, nothing closer is advised.
+    for proven, wrong in (((0.5, 0.5), True), ((0.9, 0.95), False), ((1.5, 1.6), True), ((-np.inf, np.inf), False)):
+        (found,) = of_theta(1 - 1.01 * FAR_HALF_WIDTHS * half, rewards, estimate, proven)
+        assert (ADVICE in found.text) is not wrong
+        assert (CONTRADICTED in found.text) is wrong
     withheld = Estimate("theta", 1.0, 0.01, withheld="of few events")
     assert of_theta(1.9, rewards, withheld) == []
     assert math.isnan(half_widths(1.9, withheld))

@@ -17,6 +17,7 @@ from omegaconf import OmegaConf
 from erl_torch import InputError, Solution, Status, Transitions, evaluate
 from erl_torch.cli import main as cli
 from erl_torch.learners import LEARNERS
+from erl_torch.run import loop
 from erl_torch.run.training import train
 
 SMALL = ("experience.n_episodes=20", "learner.n_epochs=2", "learner.n_bias=3")
@@ -27,6 +28,13 @@ def finished(tmp_path_factory):
     directory = tmp_path_factory.mktemp("run")
     result = train(composed(*SMALL), directory)
     return directory, result
+
+
+def test_a_run_that_mostly_evaluates_says_so_once(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(loop, "LONG", 0.0)
+    monkeypatch.setattr(loop, "MOST", 0.0)
+    train(composed("learner.n_epochs=3", "learner.n_bias=2", "evaluation.pictures=false"), tmp_path)
+    assert capsys.readouterr().err.count("seconds went into evaluation: evaluation.every=10 measures") == 1
 
 
 def test_run_directory(finished):

@@ -41,7 +41,10 @@ def dotted(argument: str) -> str:
     for i, name in enumerate(names):
         if parts := COLON.fullmatch(name):
             names[i] = f"{parts[1]}.{parts[2]}"
-            resolve(names[i], key)
+            try:
+                resolve(names[i], key)
+            except InputError as error:
+                raise InputError(error.key, name if error.value == names[i] else error.value, error.allowed) from error
     return f"{key}={','.join(names)}"
 
 

@@ -45,6 +45,11 @@ ADVICE = (
 )
 
 
+CONTRADICTED = (
+    "the data contradict what is proven, as those of another problem, or of the part of this one that was met, do"
+)
+
+
 class Reservation(NamedTuple):
     """``kind`` is the same in all runs that have the reservation; ``text`` has the figures of one run."""
 
@@ -373,7 +378,12 @@ def of_outcome(status: Status, message: str, learnt: float, prior: float) -> lis
     return reservations
 
 
-def of_theta(theta: float | None, rewards: tuple[float, float], estimate: Estimate | None = None) -> list[Reservation]:
+def of_theta(
+    theta: float | None,
+    rewards: tuple[float, float],
+    estimate: Estimate | None = None,
+    bounds: tuple[float, float] | None = None,
+) -> list[Reservation]:
     """What a learnt theta shows by itself.
 
     Rewards in [low, high] have theta* in [-high, -low], whatever the dynamics: no policy earns more than high per step,
@@ -383,6 +393,7 @@ def of_theta(theta: float | None, rewards: tuple[float, float], estimate: Estima
         theta: learnt; None or NaN where there is none, which shows nothing.
         rewards: (low, high) of the stream.
         estimate: theta of the data; it shows nothing where its interval is withheld.
+        bounds: what is proven of theta*, where a model is known: of data that contradict it nothing is advised.
     """
     if theta is None or not np.isfinite(theta):
         return []
@@ -399,6 +410,10 @@ def of_theta(theta: float | None, rewards: tuple[float, float], estimate: Estima
     if estimate is None:
         return []
     away = half_widths(theta, estimate)
+    advice = ADVICE
+    if contradicted(estimate, bounds):
+        assert bounds is not None
+        advice = f"{CONTRADICTED} ({proven(bounds, None)}), so that to be closer to them is not to be closer to theta*"
     if estimate.standard_error == 0 and abs(theta - estimate.value) > CHANCELESS_ERROR * max(
         rewards[1] - rewards[0], RANGE_MARGIN * max(abs(low), abs(high))
     ):
@@ -406,7 +421,7 @@ def of_theta(theta: float | None, rewards: tuple[float, float], estimate: Estima
             Reservation(
                 "theta far from the data's",
                 f"the learnt theta is {theta:.6g}, and that of the data, in which nothing is left to chance, is "
-                f"{estimate.value:.6g}: {ADVICE}",
+                f"{estimate.value:.6g}: {advice}",
             )
         ]
     if not away > FAR_HALF_WIDTHS:
@@ -418,9 +433,19 @@ def of_theta(theta: float | None, rewards: tuple[float, float], estimate: Estima
         Reservation(
             "theta far from the data's",
             f"the learnt theta {theta:.6g} is {away:.3g} half widths from what the data say, {estimate} (95%): "
-            f"{ADVICE}",
+            f"{advice}",
         )
     ]
+
+
+def contradicted(estimate: Estimate | None, bounds: tuple[float, float] | None) -> bool:
+    """Whether ``bounds``, proven of theta*, lie outside what the data say, beyond chance: the stream did not meet all
+    states, say."""
+    if estimate is None or estimate.withheld or bounds is None:
+        return False
+    low, high = estimate.interval(1 - LEVEL)
+    margin = SINGLE_PRECISION * max(abs(low), abs(high))
+    return bool(low - margin > bounds[1] or high + margin < bounds[0])
 
 
 def half_widths(theta: float | None, estimate: Estimate | None) -> float:

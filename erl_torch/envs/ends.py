@@ -9,8 +9,8 @@ import gymnasium as gym
 from erl_torch import checks
 from erl_torch.checks import InputError
 from erl_torch.envs.encoded import encoded
-from erl_torch.mdp.ends import EndRule, Failures, Rule
-from erl_torch.mdp.from_gymnasium import best_end, sizes
+from erl_torch.mdp.ends import EndRule, Rule, with_end_reward
+from erl_torch.mdp.from_gymnasium import end_pays, model_ends, rule_of_ends
 
 
 class EndReward(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
@@ -26,14 +26,17 @@ class EndReward(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs
             package's).
 
     Raises:
-        InputError: an end_reward that is not finite, or a rule that cannot be used.
+        InputError: an end_reward that is not finite, or that no end gets, or a rule that cannot be used.
     """
 
     def __init__(self, env: gym.Env[Any, Any], end_reward: float, failures: Rule = "default") -> None:
         gym.utils.RecordConstructorArgs.__init__(self, end_reward=end_reward, failures=failures)
         super().__init__(env := encoded(env))
-        rule = Failures.of(failures, best_end(env), sizes(env)[0])
+        rule = rule_of_ends(failures, env)
         self.rule = EndRule(rule, checks.finite("end_reward", end_reward))
+        if end_pays(env) is not None:  # then the environment tells of all its ends
+            ends = model_ends(env, failures)
+            with_end_reward(0.0 * ends.ended, ends.ended, ends.failed, end_reward)
         if end_reward < 0 and rule.limit == -float("inf") and not rule.states:
             raise InputError("end_reward", end_reward, "0, or a bonus > 0: no end is a failure by this rule")
         if end_reward > 0 and rule.every:

@@ -26,12 +26,12 @@ from erl_torch.experience.formats.encoding import Encoding, Met
 from erl_torch.experience.formats.format import Options
 from erl_torch.experience.formats.order import in_order, stride_of
 from erl_torch.experience.formats.roles import Roles, roles_of
-from erl_torch.experience.formats.rows import Rows, Seen, terminations
+from erl_torch.experience.formats.rows import SCALE, TERMINATED, Rows, Seen, limit_of, note_of_cuts, terminations
 from erl_torch.experience.formats.table import Cells, InOrder, Table, is_frame, of_frame, of_npz, open_table
 from erl_torch.experience.recording import CHUNK, READ, FileRecording, Recordable
 from erl_torch.experience.transitions import COLUMNS, WEIGHT, Transitions
 from erl_torch.labels import Labels
-from erl_torch.mdp.ends import RULES, EndRule, Failures
+from erl_torch.mdp.ends import RULES, UNPAID, EndRule, Failures
 from erl_torch.mdp.tabular import check_policy, uniform
 from erl_torch.problem import Problem
 
@@ -57,6 +57,7 @@ class LogReport:
     first_bad: str
     last: int  # last rows of episodes, left out: no state after
     before_gaps: int  # rows left out: the next row is missing
+    at_limit: int  # rows left out that terminate at a time limit, where all other episodes are cut
     gaps: int | None  # rows that do not go on where the row before led to; None where that cannot be seen
     states: int
     actions: int
@@ -76,7 +77,19 @@ class LogReport:
     never_left: int  # states
     never_left_labels: list[str]
     unseen_actions: str
+    end_reward: str  # what is added to the rewards of which ends; "" for nothing
+    ends_counted: int  # ends that it is added to
+    ends: int  # tuples that terminate an episode
     not_answered: list[str]
+
+    @property
+    def counted_ends(self) -> str:
+        """What is added to the rewards of which ends, and to how many; "" for nothing."""
+        if not self.end_reward:
+            return ""
+        some = self.ends_counted < self.ends
+        say = "; env.failures says which: default, unpaid, all or none" if some else ""
+        return f"{self.end_reward}, {self.ends_counted:,} of {self.ends:,}{say}"
 
     def content(self) -> dict[str, Any]:
         """As ``result.json`` holds it."""
@@ -87,6 +100,7 @@ class LogReport:
         lines = [("log", f"{self.path}: {_n(self.rows, 'row')}; {used}")]
         out = [
             *([f"{_n(self.last, 'last row')} of an episode, without a state after"] if self.last else []),
+            *([f"{_n(self.at_limit, 'end')} at the time limit, as all others are cut there"] if self.at_limit else []),
             *([f"{_n(self.before_gaps, 'row')} before a gap"] if self.before_gaps else []),
             *([f"{_n(self.bad, 'bad row')} (the first is {self.first_bad})"] if self.bad else []),
         ]
@@ -108,6 +122,8 @@ class LogReport:
             ]
             lines.append(("episodes", f"{self.episodes:,}: {', '.join(ends)}"))
         low, high = self.reward_range
+        if self.end_reward:
+            lines.append(("end reward", self.counted_ends))
         vary = f"they vary for {self.varying_pairs:,} of {_n(self.pairs, 'pair')} (s,a)"
         lines.append(("rewards", f"{low:g} to {high:g}, mean {self.mean_reward:.6g} a tuple; {vary}"))
         rare = ""
@@ -203,18 +219,21 @@ def read_log(
     states, actions = _encodings(source, roles, strict, told)
     sizes = states.n, actions.n
     checks.memory("n_states * n_actions", f"{sizes[0]} * {sizes[1]}", 40 * sizes[0] * sizes[1], "the counts of pairs")
-    counts = _Counts(*sizes)
     reader = Rows(source, roles, states, actions, stride=stride)
-    for batch in reader.batches(READ, strict):
-        counts.add(batch)
-        told(reader.seen.rows)
+    counts = _counted(reader, sizes, strict, told)
+    finals = reader.seen.finals
+    limit = limit_of(finals).place
+    if limit is not None and (limit, TERMINATED) in finals:
+        reader.limit = limit
+        counts = _counted(reader, sizes, strict, told)
+    note_of_cuts(reader.seen)
     if not counts.visits.any():
         raise InputError(f"path={source.path}", "0 good tuples", "at least one tuple")
     prior = prior_of(counts.visits, unseen_actions)
     if prior_policy is not None:
         prior = check_policy("prior_policy", prior_policy, *sizes)
-    ends = _end_rule(end_reward, failures, reader.seen)
-    known = Rows(source, roles, states, actions, prior, on_prior, seed, stride, ends)
+    ends = _end_rule(end_reward, failures, reader.seen, int(counts.visits.sum()))
+    known = Rows(source, roles, states, actions, prior, on_prior, seed, stride, ends, limit)
     recording = FileRecording(
         source.path, *sizes, on_bad=on_bad, chunk=chunk, report=told, format=_Prepared(known), seed=seed
     )
@@ -226,21 +245,33 @@ def read_log(
         state_labels=states.labels,
         action_labels=actions.labels,
     )
-    told_of = _report(source, roles, states, actions, counts, reader.seen, unseen_actions, bool(stride))
+    told_of = _report(source, roles, states, actions, counts, reader.seen, unseen_actions, bool(stride), ends)
     return Log(problem, recording, told_of, counts.visits)
 
 
-def _end_rule(end_reward: float, failures: str, seen: Seen) -> EndRule | None:
+def _end_rule(end_reward: float, failures: str, seen: Seen, tuples: int) -> EndRule | None:
     """What the ends count for. Raises InputError where no end gets ``end_reward``."""
     if not end_reward:
         return None
-    rule = Failures.of(failures, seen.best_end, 1)
-    some = seen.worst_end < rule.limit if end_reward < 0 else seen.best_end >= rule.limit
-    if not seen.terminated or not some:
+    others = tuples - seen.ends
+    going_on = (seen.sum_of_rewards - seen.sum_of_ends) / others / SCALE if others else -np.inf
+    rule = EndRule(Failures.of(failures, seen.best_end, 1, going_on), end_reward)
+    if not _counted_ends(rule, seen):
         kind = "failure" if end_reward < 0 else "success"
-        which = "no row terminates an episode" if not seen.terminated else f"no end is a {kind} by failures={failures}"
+        which = f"no end is a {kind} by failures={failures}"
+        if not seen.terminated:
+            which = "no row terminates an episode"
+        elif not seen.ends and seen.at_limit:
+            which = "all ends are at the time limit, where nothing is known of the rows that are cut without s_next"
         raise InputError("end_reward", end_reward, f"0: {which}")
-    return EndRule(rule, end_reward)
+    return rule
+
+
+def _counted_ends(rule: EndRule, seen: Seen) -> int:
+    """How many ends get the end reward."""
+    limit = rule.failures.limit
+    failed = {np.inf: seen.ends, -np.inf: 0, UNPAID: seen.unpaid_ends}.get(limit, seen.ends - seen.best_ends)
+    return failed if rule.end_reward < 0 else seen.ends - failed
 
 
 def prior_of(visits: np.ndarray, unseen_actions: str) -> np.ndarray:
@@ -348,6 +379,15 @@ class _Counts:
         self.entered[batch["s_next"]] = True
 
 
+def _counted(reader: Rows, sizes: tuple[int, int], strict: bool, told: Callable[[int], object]) -> _Counts:
+    """What all tuples have of each pair."""
+    counts = _Counts(*sizes)
+    for batch in reader.batches(READ, strict):
+        counts.add(batch)
+        told(reader.seen.rows)
+    return counts
+
+
 def _report(
     source: Table,
     roles: Roles,
@@ -357,6 +397,7 @@ def _report(
     seen: Seen,
     unseen_actions: str,
     counted_steps: bool,
+    rule: EndRule | None,
 ) -> LogReport:
     visits, tuples = counts.visits, int(counts.visits.sum())
     met = visits > 0
@@ -391,6 +432,7 @@ def _report(
         first_bad=seen.first_bad,
         last=seen.last,
         before_gaps=seen.before_gaps,
+        at_limit=seen.at_limit,
         gaps=gaps,
         states=states.n,
         actions=actions.n,
@@ -401,7 +443,7 @@ def _report(
         truncated=seen.truncated,
         cut=seen.episodes - seen.terminated - seen.truncated if ends else 0,
         reward_range=(float(counts.low.min()), float(counts.high.max())),
-        mean_reward=seen.sum_of_rewards / tuples,
+        mean_reward=seen.sum_of_rewards / tuples / SCALE,
         varying_pairs=int((counts.high > counts.low).sum()),
         pairs=int(met.sum()),
         pairs_never_seen=never_seen,
@@ -410,6 +452,9 @@ def _report(
         never_left=len(never_left),
         never_left_labels=never_left_labels,
         unseen_actions=unseen_actions,
+        end_reward="" if rule is None else str(rule),
+        ends_counted=0 if rule is None else _counted_ends(rule, seen),
+        ends=seen.ends,
         not_answered=unanswered,
     )
 

@@ -87,6 +87,8 @@ def demonstrated(
         counts = tally(kept, *prior.shape).visits.reshape(prior.shape).astype(np.float64)
     else:
         counts = checks.array("demonstrations", demonstrations, prior.shape, checks.NOT_NEGATIVE)
+        if not exact and counts.sum() < len(counts) + 0.5 and (counts != np.floor(counts)).any():
+            note("demonstrations are taken as counts of less than a step a state: a policy, or shares, need exact=True")
     total = counts.sum()
     counts = np.where(problem.prior > 0, counts[problem.states], 0.0)
     if not counts.any():

@@ -39,6 +39,7 @@ from erl_torch.solvers.soft_bellman import solve_problem
 TOLD = 1e-9  # of singular values of the advantages, relative to the largest: below, behaviour tells nothing
 WIDTH = 1e-9  # of TV - V, relative to the rewards' range, at which a value is a solution
 WARM_STEPS = 8  # Newton steps from the value of the reward before
+FALLS = (1e-8, 1e-13)  # of the objective in a step, relative, at which L-BFGS hands over to scoring; its second try
 SCORING_STEPS = 50
 SHARED = ("pattern", "elimination", "classes")  # of problems that differ in their rewards alone
 MUCH_UNSEEN = 1e-3  # of the expert's time
@@ -55,7 +56,7 @@ class RewardFit:
 
     weights: np.ndarray  # [F], reward; no part in ``unidentified``
     reward: np.ndarray  # [S, A], sum_k w_k phi_k; of a table 0 in pairs that take no part
-    standard_error: np.ndarray | None  # of ``weights``, [F]; None where the policy was exact
+    standard_error: np.ndarray | None  # of the told part of ``weights``, [F]; infinite without, None where exact
     identified: np.ndarray  # [F] bool: whether the weight itself is, not only a combination of it with others
     unidentified: np.ndarray  # [F, k], orthonormal columns: w plus any of them explains the behaviour as well
     eigenvalues: np.ndarray  # of the information of one step about the other directions, ascending, 1/reward^2
@@ -267,32 +268,34 @@ class _Objective:
 
 def _maximise(objective: _Objective, tol: float, max_iterations: int) -> tuple[np.ndarray, Linearised, bool]:
     """(weights [F], the solution there, whether the gradient is small): L-BFGS, then scoring steps."""
-    n_features = objective.features.shape[1]
-
-    def loss(x: np.ndarray) -> tuple[float, np.ndarray]:
-        at = objective.at(x)
-        if at is None:
-            return np.inf, np.zeros(n_features)
-        value, gradient = objective.evaluate(x, at)
-        return -value, -gradient
-
-    x, at = np.zeros(n_features), objective.at(np.zeros(n_features))
-    if at is None:
+    x = np.zeros(objective.features.shape[1])
+    first = objective.at(x)
+    if first is None:
         why = objective.solve(objective.problem(x))
         allowed = f"a model that solve_soft_bellman solves ({why.message or why.status.value})"
-        raise InputError("mdp", f"a model whose solution is {why.status.name}", allowed)
-    options = {"maxiter": max_iterations, "maxfun": 4 * max_iterations, "ftol": 1e-13, "gtol": tol, "maxcor": 20}
-    x = minimize(loss, x, jac=True, method="L-BFGS-B", options=options).x
-    at = objective.at(x)
-    assert at is not None
-    value, gradient = objective.evaluate(x, at)
-    for _ in range(SCORING_STEPS):
-        if np.abs(gradient).max() <= 1e-3 * tol:
+        raise InputError("mdp", f"a model whose solution without rewards is {why.status.name}", allowed)
+    best = x, first, *objective.evaluate(x, first)
+
+    def loss(x: np.ndarray) -> tuple[float, np.ndarray]:
+        nonlocal best
+        at = objective.at(x)
+        if at is None:
+            return np.inf, np.zeros(len(x))
+        value, gradient = objective.evaluate(x, at)
+        if value >= best[2]:
+            best = x.copy(), at, value, gradient
+        return -value, -gradient
+
+    for fall in FALLS:
+        options = {"maxiter": max_iterations, "maxfun": 4 * max_iterations, "ftol": fall, "gtol": tol, "maxcor": 20}
+        minimize(loss, best[0], jac=True, method="L-BFGS-B", options=options)
+        for _ in range(SCORING_STEPS):
+            if np.abs(best[3]).max() <= 1e-3 * tol or (better := _scored(objective, *best)) is None:
+                break
+            best = better
+        if np.abs(best[3]).max() <= tol:
             break
-        better = _scored(objective, x, at, value, gradient)
-        if better is None:
-            break
-        x, at, value, gradient = better
+    x, at, _, gradient = best
     return objective.weights(x), at, bool(np.abs(gradient).max() <= tol)
 
 
@@ -359,7 +362,8 @@ def _information(objective: _Objective, at: Linearised, told: np.ndarray) -> tup
     variance = np.einsum("fi,ij,fj->f", spread, axes.T @ _squares(at, advantages, reach) @ axes, spread)
     error = np.sqrt(np.maximum(variance, 0.0))
     lost = np.sqrt(((told @ axes[:, ~known]) ** 2).sum(1)) > PART
-    return sizes, np.where(lost, np.inf, error)
+    untold = np.sqrt((told**2).sum(1)) < PART
+    return sizes, np.where(lost | untold, np.inf, error)
 
 
 def _divergence(policy: np.ndarray, at: Linearised) -> np.ndarray:
@@ -376,7 +380,7 @@ def _message(
     """What to know of the fit, in one line; "" where there is nothing."""
     parts = [given.message] if given.message else []
     if not converged:
-        parts.append("the maximum was not reached: weights may grow without end (a penalty keeps them)")
+        parts.append("the maximum was not reached; where weights grow without end, a penalty keeps them")
     if hidden.shape[1]:
         parts.append(f"{hidden.shape[1]} of {len(hidden)} directions of the weights change no behaviour")
     if unmet:

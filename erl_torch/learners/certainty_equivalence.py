@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
@@ -92,7 +92,7 @@ class CertaintyEquivalence(StreamLearner[CertaintyEquivalenceState, CertaintyEqu
     takes_weights: ClassVar[bool] = True
 
     beta: float = 10.0
-    optimism: float = 0.0
+    optimism: float = field(default=0.0, kw_only=True)
     tol: float = 1e-10
     max_steps: int = 200
     prior_policy: torch.Tensor | np.ndarray | None = None

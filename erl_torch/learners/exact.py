@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
@@ -83,7 +83,7 @@ class Exact:
     assumed_optimism: ClassVar[float | None] = None
 
     beta: float = 10.0
-    optimism: float = 0.0
+    optimism: float = field(default=0.0, kw_only=True)
     method: str = "biasing"
     tol: float = 1e-10
     max_steps: int = 200

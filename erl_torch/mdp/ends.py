@@ -10,7 +10,9 @@ count. ``end_reward`` is added to the reward of the step that ends an episode:
 Which ends are failures is the user's to say, by a rule, ``failures``:
 
     default  those whose step pays at most 0, where some other end pays more: FrozenLake's holes; none in CliffWalking,
-             Taxi and MountainCar, which end in success only, and none in CartPole, which pays its falls too
+             Taxi and MountainCar, which end in success only, and none in CartPole, which pays its falls too. Every
+             end, where the best of them pays at most 0 and less than a step that goes on does in the mean: then the
+             best is only less bad, and no success
     unpaid   those whose step pays at most 0
     all      every end: CartPole
     none     no end
@@ -33,6 +35,7 @@ from erl_torch.checks import InputError
 
 RULES = ("default", "unpaid", "all", "none")
 Rule = str | Sequence[int]
+ROUNDING = 1e-9  # relative, of mean rewards
 UNPAID = float(np.nextafter(0.0, 1.0))  # a step that pays less than this pays at most 0
 
 
@@ -44,8 +47,9 @@ class Failures:
     states: tuple[int, ...] | None = None
 
     @classmethod
-    def of(cls, rule: Rule, best: float | None, n_states: int) -> Failures:
-        """``rule`` where the best end pays ``best``; None is not known.
+    def of(cls, rule: Rule, best: float | None, n_states: int, going_on: float = -np.inf) -> Failures:
+        """``rule`` where the best end pays ``best``, None is not known, and a step that does not end an episode
+        ``going_on``, in the mean; -infinite is not known.
 
         Raises InputError for another rule, for the default where ``best`` is not known, and for states out of range.
         """
@@ -60,8 +64,17 @@ class Failures:
             if best is None:
                 allowed = "unpaid, all, none, or a list of states: the environment does not tell beforehand how it ends"
                 raise InputError("failures", rule, allowed)
-            return cls(min(best, UNPAID))
+            worse = best < going_on - ROUNDING * max(1.0, abs(best), abs(going_on))
+            return cls(np.inf if np.isfinite(best) and best <= 0 and worse else min(best, UNPAID))
         return cls({"unpaid": UNPAID, "all": np.inf, "none": -np.inf}[rule])
+
+    def __str__(self) -> str:
+        """Which ends they are, in words."""
+        if self.states is not None:
+            return f"the ends in states {', '.join(map(str, self.states))}" if self.states else "no end"
+        if np.isinf(self.limit):
+            return "every end" if self.limit > 0 else "no end"
+        return "the ends that pay at most 0" if self.limit == UNPAID else f"the ends that pay less than {self.limit:g}"
 
     @property
     def every(self) -> bool:
@@ -86,6 +99,17 @@ class EndRule(NamedTuple):
         failed = bool(self.failures.among(reward, state))
         return failed, self.end_reward if failed == (self.end_reward < 0) else 0.0
 
+    def __str__(self) -> str:
+        """What is added to which ends, in words."""
+        failures = str(self.failures)
+        if self.end_reward < 0:
+            which = failures
+        elif failures == "no end":
+            which = "every end"
+        else:
+            which = f"all but {failures}"
+        return f"{self.end_reward:+g} at {which}"
+
 
 def failing_ends(
     reward: ArrayLike, terminated: ArrayLike, state: ArrayLike, n_states: int, failures: Rule = "default"
@@ -97,7 +121,7 @@ def failing_ends(
         terminated: [N] bool; a truncated episode has not ended.
         state: [N], that each step led to (of an ending step: the state where it ended, not the next start).
         n_states: whole number >= 1.
-        failures: the rule; the best end of the log is what "default" compares with.
+        failures: the rule; the best end of the log, and its mean step, are what "default" compares with.
 
     Raises:
         InputError: as ``Failures.of``, or columns of different lengths.
@@ -106,7 +130,8 @@ def failing_ends(
     if not r.shape == over.shape == s.shape or r.ndim != 1:
         raise InputError("terminated", f"array of shape {over.shape}", f"of the shape of reward and state, {r.shape}")
     best = float(r[over].max()) if over.any() else -np.inf
-    return np.asarray(over & Failures.of(failures, best, n_states).among(r, s))
+    going_on = float(r[~over].mean()) if not over.all() else -np.inf
+    return np.asarray(over & Failures.of(failures, best, n_states, going_on).among(r, s))
 
 
 def with_end_reward(reward: ArrayLike, ended: ArrayLike, failed: ArrayLike, end_reward: float) -> np.ndarray:

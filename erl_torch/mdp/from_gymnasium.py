@@ -193,7 +193,7 @@ def tabular_mdp(
     n_states, n_actions = sizes(env)
     row, to, p, r, end = _entries(_table(env), env.unwrapped)
     if end_reward:
-        failed = _failures(failures, r, end, n_states).among(r, to) & end
+        failed = _failures(failures, r, end, n_states, p).among(r, to) & end
         r = with_end_reward(r, end, failed, end_reward)
     n_rows = n_states * n_actions
     first = _start(_own_start(env) if start is None else start, n_states)
@@ -244,33 +244,55 @@ def model_ends(env: gym.Env[Any, Any], failures: Rule = "default") -> Ends:
     if mdp is not None:
         ends = ending_states(env, mdp.n_states)
         over = np.repeat(ends[:, None], mdp.n_actions, 1)
-        rule = _failures(failures, mdp.reward, over, mdp.n_states)
+        rule = _failures(failures, mdp.reward, over, mdp.n_states, mdp.allowed)
         state = np.repeat(np.arange(mdp.n_states)[:, None], mdp.n_actions, 1)
         return Ends(over.astype(np.float64), (over & rule.among(mdp.reward, state)).astype(np.float64))
     n_states, n_actions = sizes(env)
     row, to, p, r, end = _entries(_table(env), env.unwrapped)
-    failed = _failures(failures, r, end, n_states).among(r, to) & end
+    failed = _failures(failures, r, end, n_states, p).among(r, to) & end
     chances = (np.bincount(row[x], p[x], n_states * n_actions).reshape(n_states, n_actions) for x in (end, failed))
     return Ends(*chances)
 
 
-def best_end(env: gym.Env[Any, Any]) -> float | None:
-    """The largest reward of a step that ends an episode, where the environment tells; -infinite if none ends one."""
+class Pays(NamedTuple):
+    """What the steps of an environment pay."""
+
+    best_end: float  # the largest reward of a step that ends an episode; -infinite if none ends one
+    going_on: float  # mean reward of the others, all pairs (s,a) alike; -infinite without any
+
+
+def end_pays(env: gym.Env[Any, Any]) -> Pays | None:
+    """What the ends of an environment pay, and its other steps; None where it does not tell."""
     if changed_by(env) is None and overridden(env) is None:
         mdp = known_mdp(env)
         if mdp is not None:
-            return float(mdp.reward[ending_states(env, mdp.n_states)].max(initial=-np.inf))
+            over = np.repeat(ending_states(env, mdp.n_states)[:, None], mdp.n_actions, 1)
+            return _pays(mdp.reward, over, mdp.allowed)
         if has_table(env):
             try:
-                _, _, _, r, end = _entries(_table(env), env.unwrapped)
+                _, _, p, r, end = _entries(_table(env), env.unwrapped)
             except InputError:  # a table that cannot be read tells nothing
                 return None
-            return float(r[end].max(initial=-np.inf))
+            return _pays(r, end, p)
     return None
 
 
-def _failures(rule: Rule, reward: np.ndarray, end: np.ndarray, n_states: int) -> Failures:
-    return Failures.of(rule, float(reward[end].max(initial=-np.inf)), n_states)
+def rule_of_ends(failures: Rule, env: gym.Env[Any, Any]) -> Failures:
+    """``failures`` in ``env``. Raises InputError as ``Failures.of`` does."""
+    pays = end_pays(env)
+    best, going_on = (None, -np.inf) if pays is None else pays
+    return Failures.of(failures, best, sizes(env)[0], going_on)
+
+
+def _pays(reward: np.ndarray, end: np.ndarray, weight: np.ndarray) -> Pays:
+    w = np.where(end, 0.0, weight)
+    total = w.sum()
+    return Pays(float(reward[end].max(initial=-np.inf)), float((w * reward).sum() / total) if total else -np.inf)
+
+
+def _failures(rule: Rule, reward: np.ndarray, end: np.ndarray, n_states: int, weight: np.ndarray) -> Failures:
+    best, going_on = _pays(reward, end, weight)
+    return Failures.of(rule, best, n_states, going_on)
 
 
 def name_of(env: gym.Env[Any, Any]) -> str:

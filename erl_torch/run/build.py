@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -34,11 +35,12 @@ from erl_torch.mdp.ends import RULES, EndRule, Failures
 from erl_torch.mdp.from_gymnasium import (
     MeanRewardWarning,
     absorbing,
-    best_end,
+    end_pays,
     ending_states,
     has_table,
     known_mdp,
     model_ends,
+    rule_of_ends,
     sizes,
     tabular_mdp,
 )
@@ -81,7 +83,12 @@ def group(name: str) -> Iterator[None]:
     try:
         yield
     except InputError as error:
-        raise error.within(name) from error
+        own = error.within(name)
+        # Keys in the text too: columns.s=NAME is experience.columns.s=NAME.
+        own = InputError(
+            own.key, own.value, re.sub(r"(?<![\w.])columns\.(?=\w+(=NAME| has))", f"{name}.columns.", own.allowed)
+        )
+        raise own from error
 
 
 def make_env(cfg: DictConfig, render_mode: str | None = None) -> gym.Env[Any, Any]:
@@ -122,7 +129,11 @@ def make_env(cfg: DictConfig, render_mode: str | None = None) -> gym.Env[Any, An
                 raise
             message = f"{type(error).__name__}: {error}"
             name = spec if isinstance(spec, str) else keys["class"]
-            raise InputError("kwargs", arguments, f"arguments of {name} ({message})") from error
+            allowed = f"arguments of {name} ({message})"
+            if keys.get("kwargs") or not arguments:
+                raise InputError("kwargs", arguments, allowed) from error
+            *others, (last, value) = arguments.items()  # as they were typed
+            raise InputError("".join(f"{k}={v} env." for k, v in others) + last, value, allowed) from error
         binning = {key: keys.get(key) for key in ("bins", "low", "high", "actions") if key not in arguments}
         if any(value is not None for value in binning.values()):
             return Discretise(env, **binning)
@@ -175,12 +186,12 @@ def make_world(
             return _world_of_steps(cfg, env, failures, beta, prior)
         allowed = masks_of(env) if masking else None
         end_reward = _end_reward(cfg, env, beta, prior, allowed)
-    rule_of_ends = cfg.get("failures", "default")
+    told = cfg.get("failures", "default")
     mdp = episode = None
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", MeanRewardWarning)
         try:
-            mdp = tabular_mdp(env, on_end, allowed=allowed, end_reward=end_reward, failures=rule_of_ends)
+            mdp = tabular_mdp(env, on_end, allowed=allowed, end_reward=end_reward, failures=told)
         except InputError as error:
             if on_end == "absorb" or end_reward or masking:
                 raise error.within("env") from error
@@ -195,7 +206,7 @@ def make_world(
     rule = None if failures is None else EndRule(failures, end_reward)
     success = None
     if episode is not None:
-        chances = model_ends(env, rule_of_ends)
+        chances = model_ends(env, told)
         success = chances.ended - chances.failed
         success[absorbing(episode)] = 0.0
         success = success if success.any() else None
@@ -206,8 +217,7 @@ def _failures(cfg: DictConfig, env: gym.Env[Any, Any]) -> Failures | None:
     """The rule of ``cfg`` in ``env``; None where it is the default and the environment does not tell how it ends."""
     rule = cfg.get("failures", "default")
     rule = rule if isinstance(rule, str) else list(rule)
-    best = best_end(env)
-    return None if rule == "default" and best is None else Failures.of(rule, best, sizes(env)[0])
+    return None if rule == "default" and end_pays(env) is None else rule_of_ends(rule, env)
 
 
 def _end_reward(

@@ -38,7 +38,14 @@ from erl_torch.solution import Solution, Status
 FORMAT = 4  # 1 knew no settings, 2 no types of NumPy's numbers, 3 not which epoch was recorded last
 KEPT = 2
 RESULTS = ("result.json", "solution.npz", "replicas.npz")
-FILES = ("settings.json", *RESULTS, "bands.png", "sweep.png", "policy.csv")  # that a run writes under names of its own
+FILES = (
+    "settings.json",
+    *RESULTS,
+    "bands.png",
+    "sweep.png",
+    "dial.png",
+    "policy.csv",
+)  # that a run writes under names of its own
 # Settings that no result depends on.
 FREE = ("threads", "checkpoint_every", "keep_tuples", "experience.keep", "experience.chunk")
 COMMON = (Evaluation, NonFiniteError, Solution, Status)  # classes that any checkpoint may hold

@@ -41,6 +41,7 @@ from erl_torch.experience.sources import Simulate
 from erl_torch.files import here, read_npy, write_json, write_png
 from erl_torch.learners.learner import StreamLearner, with_prior
 from erl_torch.learners.s1 import kernels
+from erl_torch.mdp.from_gymnasium import sizes
 from erl_torch.mdp.tabular import TabularMDP, check_policy
 from erl_torch.notes import collected
 from erl_torch.run.build import learner_class, make_env, make_learner, make_source, make_world
@@ -290,6 +291,18 @@ def _cell(value: float | None) -> str:
 FIT_BYTES = 500  # of the figures of one fit
 
 
+def _learners(cfg: DictConfig, n_states: int, n_actions: int) -> dict[str, Any]:
+    """By name, with the settings that are of all."""
+    learners = {}
+    for name in cfg.learners:
+        settings = cfg.learner[name].copy()
+        for key in ("beta", "optimism", "prior_policy"):
+            if cfg[key] is not None and (key != "optimism" or key in settings):
+                settings[key] = cfg[key]
+        learners[name] = make_learner(settings, n_states, n_actions, f"learner.{name}")
+    return learners
+
+
 def run_comparison(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lambda: None) -> dict[str, Any]:
     """Run ``cfg`` (as composed from ``conf/compare.yaml``) in ``directory``; returns what ``compare.json`` holds.
 
@@ -318,19 +331,17 @@ def run_comparison(cfg: DictConfig, directory: Path, safe_point: Callable[[], No
     torch.set_num_threads(1)
     if not kernels.compiled_before():
         print(announcement(), file=sys.stderr)
-    with collected(), contextlib.closing(make_env(cfg.env)) as env:
-        world = make_world(cfg.env, env, safe_point, cfg.beta)
+    with collected() as notes, contextlib.closing(make_env(cfg.env)) as env:
+        learners = _learners(cfg, *sizes(env))
+        first = next(iter(learners.values()))
+        prior = first.prior_policy
+        if prior is not None:
+            prior = check_policy("prior_policy", prior, *sizes(env))
+        world = make_world(cfg.env, env, safe_point, first.beta, prior)
     # The start of the stream may be another than that of the episodes; the optimum does not depend on it.
     mdp = world.source if isinstance(world.source, TabularMDP) else world.mdp
     if mdp is None:
         raise InputError("env", cfg.env.name, "one with a known model: gaps are measured against its exact solution")
-    learners = {}
-    for name in cfg.learners:
-        settings = cfg.learner[name].copy()
-        for key in ("beta", "optimism", "prior_policy"):
-            if cfg[key] is not None and (key != "optimism" or key in settings):
-                settings[key] = cfg[key]
-        learners[name] = make_learner(settings, mdp.n_states, mdp.n_actions, f"learner.{name}")
     behaviour = cfg.experience.behaviour_policy
     total = len(learners) * cfg.seeds
     with tqdm(
@@ -349,12 +360,12 @@ def run_comparison(cfg: DictConfig, directory: Path, safe_point: Callable[[], No
             cfg.experience.episode_length,
             range(cfg.seed, cfg.seed + cfg.seeds),
             None if behaviour is None else read_npy(behaviour, "experience.behaviour_policy"),
-            next(iter(learners.values())).prior_policy,
+            first.prior_policy,
             cfg.n_sizes,
             cfg.processes,
             report,
         )
-    result = {"env": cfg.env.name, **found.summary(), "seconds": round(time.perf_counter() - began, 1)}
+    result = {"env": cfg.env.name, **found.summary(), "notes": notes, "seconds": round(time.perf_counter() - began, 1)}
     write_json(directory / "compare.json", result)
     title = f"{cfg.env.name}, {at(found.beta, found.optimism)}: {len(found.seeds)} seeds"
     write_png(directory / "compare.png", pictures.learning_curves(result["sizes"], result["curves"], title))

@@ -116,6 +116,13 @@ def statistics(values: np.ndarray) -> dict[str, float]:
     }
 
 
+def worth_of(rows: Sequence[Mapping[str, Any]]) -> dict[int, float]:
+    """The mean objective of each group that has one, by its number: that of the real world where optimism is not 0 in
+    all, as others are not of one scale."""
+    name = "objective_real" if any(row.get("objective_real") for row in rows) else "objective"
+    return {g: row[name]["mean"] for g, row in enumerate(rows) if row.get(name)}
+
+
 class Record:
     """Figures of all replicas, record by record."""
 
@@ -220,10 +227,10 @@ class Record:
     def final(self) -> dict[str, float]:
         """Means over the replicas of the group with the best objective, by tag."""
         rows = [self.statistics(group) for group in self.groups]
-        judged = [g for g, row in enumerate(rows) if row.get("objective")]
-        if not judged:
+        worth = worth_of(rows)
+        if not worth:
             return {}
-        best = max(judged, key=lambda g: rows[g]["objective"]["mean"])
+        best = max(worth, key=worth.__getitem__)
         names = [quantity.name for quantity in QUANTITIES if "Final" in quantity.prefixes]
         final = {name: rows[best][name]["mean"] for name in names if rows[best].get(name)}
         if "objective" in self.optima[best]:

@@ -26,6 +26,7 @@ from erl_torch.problem import Problem
 from erl_torch.run.checkpoint import Checkpoints, Content, Ended, check_state, rows_of
 from erl_torch.run.origin import texts
 
+LONG, MOST = 5.0, 4.0  # seconds of evaluation, and of learning, from which on a line says so
 SafePoint = Callable[[], None]
 Row = Mapping[str, Any]  # of the history: ``metrics()`` of a state
 S = TypeVar("S", bound=State)
@@ -221,6 +222,7 @@ class Run(Generic[S, E, A]):
             return self._content(outcome, board, began)
 
         last = reached()
+        measuring, silent = 0.0, not self.talks
         try:
             with self._bar() as bar:
                 bar.update(learner.work(outcome.state))
@@ -233,8 +235,15 @@ class Run(Generic[S, E, A]):
                     outcome.history.append(row)
                     milestone = learner.milestone(state)
                     if milestone or len(outcome.history) % self.every == 0:
+                        tick = time.perf_counter()
                         recorder.record(state, row, milestone, board)
                         outcome.recorded = len(outcome.history)
+                        measuring += time.perf_counter() - tick
+                    if not silent and measuring > max(LONG, MOST * outcome.seconds):
+                        silent = True
+                        text = f"{measuring:.0f} of {measuring + outcome.seconds:.0f} seconds went into evaluation"
+                        remedy = f"evaluation.every={10 * self.every} measures policies less often"
+                        tqdm.write(f"{text}: {remedy}", file=sys.stderr)
                     bar.set_postfix_str(learner.progress(state), refresh=False)
                     bar.update(learner.work(state) - bar.n)
                     if milestone and self.talks:

@@ -15,6 +15,7 @@ from erl_torch import checks, pictures
 from erl_torch.empirical import reservations
 from erl_torch.empirical.reservations import Counted, Reservation
 from erl_torch.empirical.uncertainty import Estimate
+from erl_torch.envs import grid_pictures
 from erl_torch.evaluation import Judge, evaluate
 from erl_torch.experience.collect import COLUMN_BYTES
 from erl_torch.experience.log import Log
@@ -31,7 +32,8 @@ from erl_torch.notes import note
 from erl_torch.problem import Problem
 from erl_torch.rng import streams
 from erl_torch.run.checkpoint import Content
-from erl_torch.run.groups import MOST_LOGGED, Group, Record, setting_text, statistics
+from erl_torch.run.dial import Learnt, dial_picture, exact_line
+from erl_torch.run.groups import MOST_LOGGED, Group, Record, setting_text, statistics, worth_of
 from erl_torch.run.identity import plain
 from erl_torch.run.judge import (
     SMALL,
@@ -43,7 +45,7 @@ from erl_torch.run.judge import (
     of_data,
 )
 from erl_torch.run.loop import Outcome, Row, SafePoint
-from erl_torch.run.report import Title, at, ended_as, last_rows, plural, versions
+from erl_torch.run.report import Title, at, end_reward, ended_as, last_rows, plural, versions
 from erl_torch.run.verdict import verdict_of_replicas
 from erl_torch.solution import Status
 from erl_torch.solvers import solve_soft_bellman
@@ -114,6 +116,7 @@ class ReplicaRecorder:
         for text in texts:
             note(text)
         dial = [(group.beta, group.optimism) for group in self.groups]
+        self.proven: dict[tuple[float, float], tuple[float, float] | None] = {}  # of theta*, by beta and optimism
         found = {each: self._optimum(*each) for each in dict.fromkeys(dial)}
         self.optima = [found[each] for each in dial]
         self.table = with_own(learners[0].quantities)
@@ -128,6 +131,7 @@ class ReplicaRecorder:
         optimum = solve_soft_bellman(model, beta, self.problem.prior, optimism=optimism)
         if optimum.status is not Status.CONVERGED or optimum.theta is None:
             return {}
+        self.proven[beta, optimism] = optimum.theta_bounds
         figures = {"theta": optimum.theta, "delta_max": optimum.reward_bias_max, "objective": -optimum.theta}
         if self.judges.of_dial:
             figures["objective_real"] = self.judges.of_model.objective(optimum.policy.numpy(), beta)
@@ -197,6 +201,7 @@ class ReplicaRecorder:
             for k, lines in panels.items():  # on TensorBoard's small cards one panel can be read
                 card = pictures.bands({axes[k]: lines}, x_label, heading, markers, card=True)
                 board.picture(f"{name}/{k}", card, step)
+        self._draw_dial(solution, title, board, step)
         rate = outcome.state.work / max(outcome.seconds, 1e-9)
         board.scalars({"time/tuples_per_second": rate}, step)
         board.scalars(self.recorded.final(), step)
@@ -206,6 +211,23 @@ class ReplicaRecorder:
         states, actions = self.problem.names
         named = (replace(one, state_labels=states, action_labels=actions) for one in solution.solutions)
         return ReplicaSolution(tuple(named), solution.failures)
+
+    def _draw_dial(self, solution: ReplicaSolution, title: str, board: Board, step: int) -> None:
+        """``dial.png``, where optimism alone varies and the model is small."""
+        model = self.judges.model
+        if list(self.groups[0].settings) != ["optimism"] or model is None or model.n_states > SMALL:
+            return
+        learnt = []
+        for group in self.groups:
+            own = [solution.solutions[r] for r in np.arange(len(self.replicas))[group.members]]
+            theta = np.array([np.nan if one.theta is None else one.theta for one in own])
+            learnt.append(Learnt(group.optimism, theta, np.stack([one.policy.numpy() for one in own])))
+        grid = None if self.problem.env is None else grid_pictures.grid_of(self.problem.env)
+        values = [group.optimism for group in self.groups]
+        line = exact_line(model, self.groups[0].beta, self.problem.prior, values, grid)
+        picture = dial_picture(learnt, line, model, grid, f"{title}, beta {self.groups[0].beta:g}")
+        write_png(board.directory / "dial.png", picture)
+        board.picture("dial", picture, step)
 
     @property
     def _n_each(self) -> int:
@@ -218,8 +240,10 @@ class ReplicaRecorder:
         rows = self.recorded.rows["objective"] if exact else [np.full(len(solution), np.nan)]
         return [
             reservations.of_outcome(one.status, one.message, float(learnt), float(prior))
-            + reservations.of_theta(one.theta, *against)
-            for one, learnt, prior, against in zip(solution.solutions, rows[-1], rows[0], self.data, strict=True)
+            + reservations.of_theta(one.theta, *against, self.proven.get((of.beta, of.optimism)))
+            for one, of, learnt, prior, against in zip(
+                solution.solutions, self.replicas.learners, rows[-1], rows[0], self.data, strict=True
+            )
         ]
 
     def save(self, solution: ReplicaSolution, directory: Path) -> None:
@@ -246,7 +270,6 @@ class ReplicaRecorder:
     def result(self, outcome: Outcome[ReplicaState], solution: ReplicaSolution) -> dict[str, Any]:
         stopped = outcome.stopped
         rows = [self.recorded.statistics(group) for group in self.groups]
-        objectives = [row["objective"]["mean"] for row in rows if row.get("objective")]
         return {
             "env": self.title.env,
             "learner": self.title.learner,
@@ -256,7 +279,7 @@ class ReplicaRecorder:
             "status": Status.STOPPED.name.lower() if stopped else _status(solution),
             "message": f"{type(stopped).__name__}: {stopped}" if isinstance(stopped, Exception) else "",
             "failures": {str(r): str(error) for r, error in solution.failures.items()},
-            "objective": max(objectives, default=None),  # of the best group
+            "objective": max(worth_of(rows).values(), default=None),  # of the best group
             "groups": [
                 {
                     "settings": {k: plain(k, v, 1) for k, v in group.settings.items()},
@@ -270,6 +293,7 @@ class ReplicaRecorder:
             "data_half_widths": self._half_widths(solution),
             "n_experience": longest(self.experience),
             "n_tuples": outcome.state.work,
+            "end_reward": end_reward(self.problem, self.log),
             "seconds_learning": round(outcome.seconds, 3),
             "versions": versions(),
             **({} if self.log is None else {"log": self.log.report.content()}),

@@ -16,6 +16,7 @@ import torch
 import erl_torch
 from erl_torch.empirical.uncertainty import Estimate
 from erl_torch.evaluation import Evaluation
+from erl_torch.experience.log import Log
 from erl_torch.files import here
 from erl_torch.log.quantities import tagged
 from erl_torch.mdp.tabular import TabularMDP
@@ -112,12 +113,24 @@ def headline(heading: str, result: Mapping[str, Any]) -> list[str]:
     return ["", f"{heading}: {ended_as(result)}"]
 
 
+def end_reward(problem: Problem, log: Log | None) -> str | None:
+    """What is added to the rewards of which ends, in words; None for nothing."""
+    if log is not None:
+        return log.report.counted_ends or None
+    rule = problem.ends
+    if rule is None or not rule.end_reward:
+        return None
+    return f"{rule}; it counts in theta, objective and reward per step, not in the return"
+
+
 def last_rows(result: Mapping[str, Any], directory: Path) -> list[str]:
     """The last rows of a summary."""
     where = here(directory)
     seconds, learning = result["seconds"], result["seconds_learning"]
     remedy = "" if seconds < 30 or learning > seconds / 5 else "; evaluation.every=10 measures policies less often"
+    more = result["end_reward"]
     return [
+        *([f"{'end reward':18}{more}"] if more else []),
         f"{'seconds':18}{seconds:.1f}, of which {learning:.1f} learning{remedy}",
         f"{'run directory':18}{where}",
         f"{'look at it':18}tensorboard --logdir {shlex.quote(str(where))}",

@@ -35,6 +35,7 @@ from erl_torch.run.report import (
     Title,
     at,
     data_tags,
+    end_reward,
     evaluation_tags,
     figures,
     headline,
@@ -267,7 +268,8 @@ class SingleRecorder:
         exact = (self.last.objective, self.first.objective) if self.model is not None else (np.nan, np.nan)
         noted = reservations.of_outcome(solution.status, solution.message, *exact)
         if self.counts is not None:
-            noted += reservations.of_theta(solution.theta, self.counts.tally.reward_range, self.estimate)
+            known = self.counts.tally.reward_range, self.estimate, solution.theta_bounds
+            noted += reservations.of_theta(solution.theta, *known)
         for _, text in noted:
             note(text)
         rate = position / max(outcome.seconds, 1e-9)
@@ -315,6 +317,7 @@ class SingleRecorder:
             "k": solution.k,
             "n_experience": n_experience,
             f"n_{self.learner.unit}": solution.n_steps,
+            "end_reward": end_reward(self.problem, self.log),
             "seconds_learning": round(outcome.seconds, 3),
             "versions": versions(),
             "data": data,

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from erl_torch.empirical.reservations import half_widths
+from erl_torch.empirical.reservations import CONTRADICTED, contradicted, half_widths
 from erl_torch.empirical.uncertainty import Estimate
 from erl_torch.solution import Solution, Status, proven
 
@@ -49,7 +49,8 @@ def verdict(thetas: Sequence[float], solution: Solution, estimate: Estimate | No
             ("still moving", f"{'no' if settled else 'yes'}: by {moved:.2g} over the last {n} of {len(thetas)}")
         )
     table = "".join(f"| {name} | {text} |\n" for name, text in rows)
-    answer = _answer(solution, settled, away if known else None)
+    opposed = contradicted(estimate, bounds)
+    answer = _answer(solution, settled, away if known else None, opposed)
     return f"{QUESTION}**{answer}**\n\ntheta = {theta:z.6g}\n\n| | |\n|---|---|\n{table}"
 
 
@@ -70,7 +71,7 @@ def verdict_of_replicas(away: Sequence[float]) -> str:
     )
 
 
-def _answer(solution: Solution, settled: bool, away: float | None) -> str:
+def _answer(solution: Solution, settled: bool, away: float | None, opposed: bool) -> str:
     if solution.status in UNANSWERED:
         return f"Not answered: the run ended before it was through ({solution.status.name.lower()})."
     assert solution.theta is not None
@@ -82,6 +83,8 @@ def _answer(solution: Solution, settled: bool, away: float | None) -> str:
         return f"Not settled: theta still moves.{constant}"
     if away is None:
         return "It has settled. Whether at theta*, no data tell."
+    if opposed:
+        return f"It has settled, but not at theta*: {CONTRADICTED}."
     if away <= 1:
         return "Yes, as far as the data can tell: it has settled inside their 95% interval."
     return "It has settled, but outside the data's 95% interval: the learner has an error of its own."

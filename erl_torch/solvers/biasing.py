@@ -93,11 +93,11 @@ def solve_biasing(
         optimism: as in ``solve_soft_bellman``. Convergence is proven from 0 to 1; beyond, it is measured.
 
     Returns:
-        A Solution with ``k`` (None if the KL test never held) and the certificate of the last value. Where rounding
-        alone keeps the bounds apart, a few Newton steps improve that value first. Status REDUCIBLE, and no theta, where
-        the states that the start leads to are not one class (with ``target``, in one of the two MDPs): the eigenvector
-        needs that. ``solve_soft_bellman`` needs less; the message says where it serves. Status NO_SINGLE_RATE below
-        optimism 0 where the bounds stay apart; they hold for every start.
+        A Solution with ``k`` (None if the KL test had not held by then) and the certificate of the last value. Where
+        rounding alone keeps the bounds apart, a few Newton steps improve that value first. Status REDUCIBLE, and no
+        theta, where the states that the start leads to are not one class (with ``target``, in one of the two MDPs): the
+        eigenvector needs that. ``solve_soft_bellman`` needs less; the message says where it serves. Status
+        NO_SINGLE_RATE below optimism 0 where the bounds stay apart; they hold for every start.
 
     Raises:
         InputError: an argument out of range, or a target of another shape.

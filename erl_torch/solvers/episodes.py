@@ -61,7 +61,8 @@ def evaluate_episodes(
 
     Returns:
         The figures. Without a horizon, where the policy may never come to an end: infinite steps, and a return that is
-        that of the steps before where all that follows pays 0; otherwise it is NaN, between infinite bounds.
+        that of the steps before where all that follows pays 0; otherwise it is NaN, between infinite bounds. Where
+        an end is so far that double precision does not reach it, figures are NaN between bounds that hold.
 
     Raises:
         InputError: a policy that is not [S, A], no end, or a horizon below 1.
@@ -136,15 +137,15 @@ def _until_the_end(
 
     def solved(table: np.ndarray, steps: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         c = np.vstack([table[on], np.zeros(n_actions)])
-        x = np.zeros(k + 1) if lu is None else lu.poisson((own * c).sum(1))[1]
+        x = np.full(k + 1, np.nan) if lu is None else lu.poisson((own * c).sum(1))[1]
+        if not np.isfinite(x).all():  # beyond double precision
+            return np.full(k, np.nan), np.full(k, 0.0 if steps is None else -np.inf), np.full(k, np.inf)
         low, high = (g[:k] for g in policy_gains(transition, c, own, 1.0, own, x))
         least, most = float(low.min(initial=0.0)), float(high.max(initial=0.0))
         x = x[:k]
         if steps is None:  # c = 1: x + least h <= h <= x + most h
             steps = up(up(x / (1 - most))) if most < 0.5 else np.full(k, np.inf)
             return x, down(down(x / (1 - least))), steps
-        if lu is None:
-            return x, np.full(k, -np.inf), np.full(k, np.inf)
         return x, down(down(x + down(least * steps))), up(up(x + up(most * steps)))
 
     of_steps = solved(tables[-1], None)

@@ -59,11 +59,11 @@ class ExitSolution(ValueSolution):
     """A ValueSolution of a process that ends.
 
     ``value`` is 0 at the ends, and -infinite where no end can be reached; where ``solved`` is false, the policy is the
-    prior.
+    prior. Without a certificate nothing is solved: values are NaN, or infinite, between bounds that hold.
     """
 
     ends: torch.Tensor  # [S] bool
-    solved: torch.Tensor  # [S] bool: the start leads there, and an end can be reached from there
+    solved: torch.Tensor  # [S] bool: the start leads there, an end can be reached from there, and bounds were found
     steps: torch.Tensor  # [S], expected steps to an end under the policy, but for rounding
     steps_bound: torch.Tensor  # [S], at least the expected steps to an end under the optimal policy
     avoiding: tuple[Avoiding, ...]
@@ -252,7 +252,7 @@ class _Found(NamedTuple):
     status: Status
     message: str
     avoiding: list[Avoiding]
-    infinite: np.ndarray  # bool: V = +infinity
+    solved: bool  # a certificate was found
 
 
 def _solve(inside: _Inside, tol: float, max_steps: int) -> _Found:
@@ -277,15 +277,13 @@ def _solve(inside: _Inside, tol: float, max_steps: int) -> _Found:
         failed = True
     certified = None if failed else _certificate(inside, value, steps)
     if certified is None and k:
-        return _explained(inside, avoiding, value, steps, n_steps, max_steps)
+        return _explained(inside, avoiding, n_steps, max_steps)
     low, high, bound = certified or (np.zeros(0), np.zeros(0), np.zeros(0))
     policy = soft_backup(p.action_value(value), p.prior, p.beta)[1]
     gap = _gap(inside, value, steps, policy, high)
     narrow = k == 0 or float((high - low).max()) <= tol * scale(p, value, policy)
     status = Status.CONVERGED if narrow else Status.STEP_LIMIT if n_steps >= max_steps else Status.STAGNATED
-    return _Found(
-        value[:k], low, high, policy[:k], steps[:k], bound, gap, n_steps, status, "", avoiding, np.zeros(k, bool)
-    )
+    return _Found(value[:k], low, high, policy[:k], steps[:k], bound, gap, n_steps, status, "", avoiding, True)
 
 
 def _widths(inside: _Inside, value: np.ndarray, steps: np.ndarray) -> np.ndarray:
@@ -360,10 +358,8 @@ def _gap(inside: _Inside, value: np.ndarray, steps: np.ndarray, policy: np.ndarr
     return np.inf
 
 
-def _explained(
-    inside: _Inside, avoiding: list[Avoiding], value: np.ndarray, steps: np.ndarray, n_steps: int, max_steps: int
-) -> _Found:
-    """No certificate: which way round it is that pays, or that rounding is in the way."""
+def _explained(inside: _Inside, avoiding: list[Avoiding], n_steps: int, max_steps: int) -> _Found:
+    """No certificate: which way round it is that pays, or that rounding is in the way. No number is claimed."""
     k, p = inside.k, inside.problem
     paying = []
     for component in avoiding:
@@ -391,12 +387,11 @@ def _explained(
     else:
         status, message = Status.STAGNATED, "no bound was found: some way round loses next to nothing"
     prior = p.prior[:k] / p.prior[:k].sum(1, keepdims=True)
-    value = np.where(infinite, np.inf, np.nan if status is Status.ILL_POSED else value[:k])
+    value = np.where(infinite, np.inf, np.nan)
     empty = np.full(k, np.inf)
-    steps = np.where(np.isfinite(steps[:k]), steps[:k], np.inf)
     return _Found(
-        value, np.where(infinite, np.inf, -np.inf), empty, prior, steps, empty, np.inf, n_steps, status, message,
-        avoiding, infinite,
+        value, np.where(infinite, np.inf, -np.inf), empty, prior, np.full(k, np.nan), empty, np.inf, n_steps, status,
+        message, avoiding, False,
     )  # fmt: skip
 
 
@@ -466,7 +461,7 @@ def _solution(
         named = f"{trapped[:NAMED].tolist()}{'...' if trapped.size > NAMED else ''}"
         message = "; ".join(filter(None, [message, f"no end can be reached from states {named}: their value is -inf"]))
     solved = np.zeros(n_states, bool)
-    solved[states] = found.status is not Status.ILL_POSED
+    solved[states] = found.solved
 
     def spread(table: np.ndarray, elsewhere: float) -> np.ndarray:
         full = np.full((n_states, *table.shape[1:]), elsewhere)

@@ -26,7 +26,7 @@ from functools import cached_property
 import numpy as np
 
 from erl_torch.solvers.certificates import policy_gains, soft_backup
-from erl_torch.solvers.chains import RegenerativeLU, SingularChainError
+from erl_torch.solvers.chains import EPSILON, RegenerativeLU, SingularChainError
 from erl_torch.solvers.problem import BellmanProblem
 
 FIRST_HORIZON = 300.0  # steps
@@ -35,6 +35,9 @@ LAST_HORIZON = 1e13
 FIRST_RESIDUAL = 0.1  # relative to the reward range, at which the horizon grows; lower after each undiscounted try
 UNDISCOUNTED_WIDTH = 0.3  # of the undiscounted bounds, relative to the reward range, at which discounting may end
 SHARES = 1.0, 0.5, 0.25, 0.125  # of a step, tried in turn
+ROUNDING = 16  # of a residual, in units of the value's last place
+NEAR_ROUNDING = 1e5  # the same, from where on PATIENCE counts
+PATIENCE = 8  # steps in which the residual does not halve
 EVALUATION_STEPS = 30
 EVALUATION_RESIDUAL = 1e-3  # of a policy's value, relative to the residual of T
 
@@ -107,7 +110,8 @@ def iterate(backup: Backup, ref: int, done: Callable[[BellmanState], bool], max_
         for once in range(50):
             backed_up, policy = backup(discount * state.value)
             error = backed_up - state.value
-            if state.step >= max_steps or (once and np.ptp(error) <= residual * problem.reward_range):
+            enough = residual * problem.reward_range
+            if state.step >= max_steps or (once and np.ptp(error) <= enough) or step.is_lost(state.value, error):
                 break
             lu = step.factors(state.value, policy)
             value, steps = step.next(state.value, error, policy, lu)
@@ -136,6 +140,19 @@ class _Step:
     home: int
     discount: float
     evaluates: bool = False
+    least: float = np.inf  # residual
+    patience: int = PATIENCE
+
+    def is_lost(self, value: np.ndarray, error: np.ndarray) -> bool:
+        """Whether rounding alone is left, of values that a long horizon makes large; never at optimism 0."""
+        if not self.backup.problem.kappa:
+            return False
+        spread, place = float(np.ptp(error)), EPSILON * float(np.abs(value).max())
+        self.patience -= spread <= NEAR_ROUNDING * place
+        if spread <= 0.5 * self.least:
+            self.patience = PATIENCE
+        self.least = min(self.least, spread)
+        return self.patience <= 0 or spread <= ROUNDING * place
 
     def factors(self, value: np.ndarray, policy: np.ndarray) -> RegenerativeLU:
         problem = self.backup.problem

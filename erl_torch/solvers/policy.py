@@ -64,6 +64,34 @@ def induced_distribution(mdp: TabularMDP, policy: np.ndarray, horizon: int | Non
     return share / horizon
 
 
+def reward_variance(mdp: TabularMDP, policy: np.ndarray) -> float:
+    """lim Var(r_1 + ... + r_N)/N under ``policy`` [S, A] from the start, reward squared per step.
+
+    With h of h + g = sum_a pi (r + E h), the mean of (r + h(s') - h(s) - g)**2 in the long run. NaN where the policy
+    may end in several closed sets, of other rates, or where double precision does not tell one set.
+    """
+    chain = policy_chain(mdp, policy)
+    share = stationary_distribution(chain.transition, mdp.start)
+    label, closed = chains.classes(chain.transition)
+    ends = np.unique(label[(share > 0) & closed[label]])
+    if len(ends) != 1:
+        return float("nan")
+    inside = np.flatnonzero(label == ends[0])
+    ref = int(np.argmax(share[inside]))
+    try:
+        lu = chains.RegenerativeLU.adapted(sp.csr_array(chain.transition[inside][:, inside]), ref)
+    except chains.SingularChainError:
+        return float("nan")
+    h = np.zeros(mdp.n_states)
+    gain, h[inside] = lu.poisson(chain.reward[inside])
+    p = mdp.transition
+    rows = np.repeat(np.arange(p.shape[0]), np.diff(p.indptr))
+    # A sum of squares: nothing cancels.
+    off = mdp.reward.ravel()[rows] + h[p.indices] - h[rows // mdp.n_actions] - gain
+    weight = (share[:, None] * policy).ravel()[rows] * p.data
+    return float(weight @ off**2)
+
+
 def objective(mdp: TabularMDP, policy: np.ndarray, prior: np.ndarray, beta: float, *, optimism: float = 0.0) -> float:
     """J(pi) from the start distribution, reward per step: the stationary reward rate minus KL/beta at optimism 0.
 

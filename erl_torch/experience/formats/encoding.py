@@ -89,7 +89,10 @@ class Met:
         ordered = sorted(labels, key=_order)
         if ordered == list(range(len(ordered))) and len(kinds) == 1:
             return Encoding(len(ordered), None, kinds)
-        return Encoding(len(ordered), Labels.of_values(ordered), kinds)
+        try:
+            return Encoding(len(ordered), Labels.of_values(ordered), kinds)
+        except InputError as error:  # of a text that is no label
+            raise InputError(self.key, error.value, error.allowed) from error
 
 
 def _kind(values: Iterable[object]) -> str:

@@ -2,8 +2,8 @@
 
 Episodes become tuples as ``erl_torch.experience.collect`` has them. Where an episode terminated, s' is the first state
 of the next one (the first episode follows the last); where it was truncated, or just ends, s' is the state reached. a'
-is the action taken next where the behaviour policy was the prior (``on_prior``) and an action was taken at s'; else it
-is drawn from the prior, with the stream "behaviour" of the seed, one number per tuple.
+is the action taken next where the behaviour policy was the prior (``on_prior``), an action was taken at s', and the
+prior has it; else it is drawn from the prior, with the stream "behaviour" of the seed, one number per tuple.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class Minari:
         self.path, self.short = path, 0
         self._on_prior, self._seed = options.on_prior, options.seed
         prior = check_policy("prior_policy", options.prior_policy, options.n_states, options.n_actions)
-        self._cdf = np.cumsum(prior, axis=1)
+        self._prior, self._cdf = prior, np.cumsum(prior, axis=1)
         env = options.env
         while isinstance(env, gym.Wrapper) and not isinstance(env, Discretise):
             env = env.env
@@ -104,11 +104,13 @@ class Minari:
         s_next = batch["s_next"].copy()
         if terminated:
             s_next[-1] = begins[0]
-        cdf = self._cdf[np.clip(s_next, 0, len(self._cdf) - 1)]
+        known = np.clip(s_next, 0, len(self._cdf) - 1)  # what is out of range is named later
+        cdf = self._cdf[known]
         a_next = (cdf <= (x * cdf[:, -1])[:, None]).sum(1)
         if self._on_prior:
-            a_next[:-1] = batch["a"][1:]
-            a_next[-1] = begins[1] if terminated else a_next[-1]
+            taken = np.append(batch["a"][1:], begins[1] if terminated else -1)
+            has = self._prior[known, np.clip(taken, 0, self._prior.shape[1] - 1)] > 0
+            a_next = np.where((taken >= 0) & has, taken, a_next)
         return {**batch, "s_next": s_next, "a_next": a_next}
 
     def _tuples(self, episode: Episode, number: int, data: Spaces) -> tuple[Batch, bool]:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from erl_torch.checks import InputError
-from erl_torch.experience.formats.encoding import numbers
+from erl_torch.experience.formats.encoding import numbers, truth
 from erl_torch.experience.formats.roles import Roles
 from erl_torch.experience.formats.table import Sorted, Table
 
@@ -58,33 +58,44 @@ def stride_of(source: Table, roles: Roles, key: str = "") -> float:
         source, roles: of ``in_order``.
         key: what messages call the column, where the user has named it: it is then an error if it tells nothing.
 
-    Raises InputError for steps that go down.
+    Raises InputError for steps that go down inside an episode, and names the first such row. Without a column
+    ``episode`` one that goes down now and then may begin an episode whose end is not told: it is a gap.
     """
     if "step" not in roles or "s_next" in roles:
         return 0.0
     (name,) = roles["step"]
-    names = [name, *roles.get("episode", ())]
+    episode = roles.get("episode", ())
+    flags = [flag for role in ("terminated", "truncated") for flag in roles.get(role, ())]
     counted: Counter[float] = Counter()
     n, lost = 0, 0
-    last: tuple[Any, float] | None = None
-    for found in source.batches(names, ROWS, False):
+    last: tuple[Any, float, bool] | None = None  # episode, step, and whether it ended there
+    for found in source.batches(list(dict.fromkeys([name, *episode, *flags])), ROWS, False):
         step = numbers(found[name], False)
         if not len(step):
             continue
-        same = np.ones(len(step), bool)
+        ended = np.zeros(len(step), bool)
+        for flag in flags:
+            ended |= truth(found[flag]) == 1
+        same = np.append(False, ~ended[:-1])  # episode as the row before
         first = final = None
-        if "episode" in roles:
-            values, codes = found[names[1]].factors()
-            same[1:] = codes[1:] == codes[:-1]
-            first, final = values[codes[0]], values[codes[-1]]
-        before = np.concatenate(([last[1] if last is not None and last[0] == first else np.nan], step[:-1]))
-        up = (step - before)[same | (np.arange(len(step)) == 0)]
+        if episode:
+            values, codes = found[episode[0]].factors()
+            same[1:] &= (codes[1:] == codes[:-1]) & (codes[1:] >= 0)
+            first, final = (None if code < 0 else values[code] for code in codes[[0, -1]].tolist())
+        same[0] = last is not None and last[0] == first and not last[2] and (first is not None or not episode)
+        before = np.append(np.nan if last is None else last[1], step[:-1])
+        with np.errstate(invalid="ignore"):
+            up = np.where(same & np.isfinite(step) & np.isfinite(before), step - before, np.nan)
+        if episode and (up < 0).any():
+            i = int(np.argmax(up < 0))
+            allowed = f"at least {before[i]:.15g}, that of the row before: steps of an episode are in order of time"
+            raise InputError(f"path={source.path}: {name}[{source.number(n + i)}]", f"{step[i]:.15g}", allowed)
         up = up[np.isfinite(up)]
         if len(counted) <= MOST_STRIDES:
             # Steps of a clock differ in their last digits.
             different, times = np.unique(np.array([float(f"{x:.6g}") for x in up.tolist()]), return_counts=True)
             counted.update(dict(zip(different.tolist(), times.tolist(), strict=True)))
-        n, lost, last = n + len(step), lost + int(np.isnan(step).sum()), (final, float(step[-1]))
+        n, lost, last = n + len(step), lost + int(np.isnan(step).sum()), (final, float(step[-1]), bool(ended[-1]))
     stride, most = counted.most_common(1)[0] if counted else (0.0, 0)
     usable = 2 * most > counted.total() and 2 * lost < n
     if stride < 0 and usable:

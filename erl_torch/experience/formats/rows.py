@@ -10,6 +10,9 @@ first of the next episode (the first row follows the last). Where an episode is 
 such a column, the state of the next row; where a column ``step`` shows that rows are missing in between, it is not
 known either.
 
+No selection by outcome. Where all episodes that get to some row and do not end there are cut, a time limit, the rows
+that do terminate there are left out too (``limit_of``): if they stayed while the others go, ends would be too frequent.
+
 a' is what ``a_next`` has; where that is missing, or the prior policy of the state lacks it, or the step terminated, it
 is drawn from the prior at s', with the stream "behaviour" of the seed, one number a row.
 
@@ -19,8 +22,9 @@ from 0.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,11 +33,12 @@ from erl_torch.checks import InputError
 from erl_torch.experience.formats import table
 from erl_torch.experience.formats.encoding import LOST, UNKNOWN, Encoding, numbers, truth
 from erl_torch.experience.formats.format import Batch, Options
-from erl_torch.experience.formats.order import in_order, stride_of
+from erl_torch.experience.formats.order import ROWS, in_order, stride_of
 from erl_torch.experience.formats.roles import NEEDED, Roles, plain, roles_of
 from erl_torch.experience.formats.table import Cells, Table
 from erl_torch.mdp.ends import EndRule
 from erl_torch.mdp.tabular import check_policy
+from erl_torch.notes import note
 from erl_torch.rng import streams
 
 
@@ -54,7 +59,66 @@ def reader_of(source: Table, options: Options) -> Rows:
     actions = Encoding(options.n_actions, options.action_labels)
     source = in_order(source, roles)
     stride = stride_of(source, roles, "columns.step" if "step" in (options.columns or {}) else "")
-    return Rows(source, roles, states, actions, prior, options.on_prior, options.seed, stride)
+    rows = Rows(source, roles, states, actions, prior, options.on_prior, options.seed, stride)
+    if "terminated" in roles and {"episode", "truncated"} & roles.keys():
+        for _ in rows.batches(ROWS, False):
+            pass
+        rows.limit = limit_of(rows.seen.finals).place
+        note_of_cuts(rows.seen)
+    return rows
+
+
+# -- where episodes are cut ----------------------------------------------------------------------------------
+
+
+CUT, TERMINATED, KNOWN = range(3)  # last rows: without a state after; that terminate; cut, with a state after
+LEAST_CUT = 2  # episodes, of the same length, that make a time limit: one is where the log ends
+NOTED_EXCESS = 0.5  # standard errors of the number of ends
+SCALE = 2.0**-64  # of sums of rewards, so that they do not overflow
+FEW_ENDS = 2.0  # too many, which are not noted
+
+
+class Limit(NamedTuple):
+    """What cuts do to the ends."""
+
+    place: int | None  # steps from the first of an episode at which all are cut that get there; None: nowhere
+    terminated: int  # ends before that
+    excess: float  # how many of them are too many, in the mean, as rows that are cut where they end are left out
+
+
+def limit_of(finals: Mapping[tuple[int, int], int]) -> Limit:
+    """From the numbers of last rows by (place in the episode, kind).
+
+    Of the rows at place t that do not terminate, the share c(t) is cut and left out, all those that do terminate stay.
+    Where a cut does not depend on what the step brings, c(t) of the latter would have to go as well. At a time limit
+    c is 1; elsewhere the sum of c(t) times the ends at t is the excess.
+    """
+    places = sorted({place for place, _ in finals})
+    on, excess, terminated, limit = 0, 0.0, 0, None  # on: episodes that go on beyond the place
+    for place in reversed(places):
+        cut, ended, known = (finals.get((place, kind), 0) for kind in (CUT, TERMINATED, KNOWN))
+        if cut >= LEAST_CUT and not on and not known:
+            limit = place
+        else:
+            excess += ended * (cut / (cut + on + known) if cut else 0.0)
+            terminated += ended
+        on += cut + ended + known
+    return Limit(limit, terminated, excess)
+
+
+def note_of_cuts(seen: Seen) -> None:
+    """A note where so many rows are left out for want of a state after that ends, which need none, are too frequent."""
+    _, terminated, excess = limit_of(seen.finals)
+    go_on = seen.rows - sum(seen.finals.values())
+    excess += terminated * seen.before_gaps / max(go_on, 1)
+    if excess > max(NOTED_EXCESS * np.sqrt(terminated), FEW_ENDS):
+        share = excess / max(terminated - excess, 1.0)
+        note(
+            f"ends are too frequent in the tuples, by about {share:.2g} of their number ({excess:.0f} of "
+            f"{terminated:,}): a row that is cut, or before a gap, is left out, as no state after it is known, and one "
+            "that terminates stays; theta is off by that, and its interval does not allow for it. A column s_next, the "
+            "state after, mends it"
+        )
 
 
 # -- rows --------------------------------------------------------------------------------------------------
@@ -73,9 +137,25 @@ class Seen:
     before_gaps: int = 0  # rows left out: the next row is missing
     bad: int = 0
     first_bad: str = ""
-    sum_of_rewards: float = 0.0  # of the tuples
+    sum_of_rewards: float = 0.0  # of the tuples, times SCALE
     worst_end: float = np.inf  # rewards of the steps that terminate an episode
     best_end: float = -np.inf
+    ends: int = 0  # tuples that terminate an episode
+    best_ends: int = 0  # of them, that pay as much as the best
+    unpaid_ends: int = 0  # of them, that pay at most 0
+    sum_of_ends: float = 0.0  # their rewards
+    at_limit: int = 0  # rows that terminate where all others are cut, left out
+    finals: Counter[tuple[int, int]] = field(default_factory=Counter)  # last rows by place in the episode and kind
+
+    def ends_pay(self, reward: np.ndarray) -> None:
+        """Of tuples that terminate an episode, [n]."""
+        self.ends += len(reward)
+        self.worst_end = min(self.worst_end, reward.min(initial=np.inf))
+        best = max(self.best_end, reward.max(initial=-np.inf))
+        self.best_ends = self.best_ends * (best == self.best_end) + int((reward == best).sum())
+        self.best_end = best
+        self.unpaid_ends += int((reward <= 0).sum())
+        self.sum_of_ends += float((reward * SCALE).sum())
 
 
 class Block(NamedTuple):
@@ -91,6 +171,7 @@ class Block(NamedTuple):
     truncated: np.ndarray
     begins: np.ndarray  # another episode than the row before's, by its column
     step: np.ndarray  # NaN: not in the table
+    place: np.ndarray  # steps from the first of its episode; below 0: not known
     bad: np.ndarray
     x: np.ndarray  # in [0, 1), for a'
     weight: np.ndarray  # 1 without such a column
@@ -110,10 +191,11 @@ class Rows:
         source, roles: what is read; episodes stand together (``in_order``).
         states, actions: their numbers.
         prior_policy: [S, A], behind a'; None: a' is 0 where it is not recorded.
-        on_prior: a' is the action of the next row, where that follows.
+        on_prior: a' is the action of the next row, where that follows: it is in s', and not behind a truncated end.
         seed: of a' where it is drawn.
         stride: of ``step`` from row to row; 0: it tells nothing.
         ends: what is added to the rewards of the steps that terminate an episode; None: nothing.
+        limit: the place in their episodes at which rows that terminate are left out (``limit_of``); None: nowhere.
 
     ``seen`` is what the last pass met, or the present one has met so far.
     """
@@ -129,8 +211,9 @@ class Rows:
         seed: int = 0,
         stride: float = 0.0,
         ends: EndRule | None = None,
+        limit: int | None = None,
     ) -> None:
-        self._ends = ends
+        self._ends, self.limit = ends, limit
         self.path, self.short = source.path, 0
         self._source, self._roles, self._stride = source, roles, stride
         self._encodings = {"s": states, "s_next": states, "a": actions, "a_next": actions}
@@ -181,6 +264,7 @@ class Rows:
         names = list(dict.fromkeys(name for columns in self._roles.values() for name in columns))
         rng = streams(self._seed).behaviour
         last: list[Any] = []  # the episode of the last row
+        places = _Places(self._stride)
         for found in self._source.batches(names, rows, strict):
             parts = {role: [found[name] for name in columns] for role, columns in self._roles.items()}
             n = parts["s"][0].n_rows
@@ -211,8 +295,9 @@ class Rows:
                 wrong.found("step", ~np.isfinite(step), parts["step"], "a finite number")
             self.seen.rows += n
             x = rng.random(n) if self._cdf is not None else np.zeros(n)
+            place = places.of(begins, flags["terminated"] | flags["truncated"], step)
             yield Block(wrong.row, codes["s"], codes["a"], r, codes["s_next"], codes["a_next"], flags["terminated"],
-                        flags["truncated"], begins, step, wrong.raised(), x, weight)  # fmt: skip
+                        flags["truncated"], begins, step, place, wrong.raised(), x, weight)  # fmt: skip
 
     def _coded(
         self, role: str, parts: Mapping[str, Sequence[Cells]], terminated: np.ndarray, wrong: _Wrong
@@ -241,15 +326,18 @@ class Rows:
         seen, good = self.seen, ~now.bad
         seen.episodes += int(ends.sum())
         seen.terminated += int(now.terminated.sum())
-        of_ends = now.r[now.terminated & good]
-        seen.worst_end = min(seen.worst_end, of_ends.min(initial=np.inf))
-        seen.best_end = max(seen.best_end, of_ends.max(initial=-np.inf))
+        at_limit = now.terminated & (now.place == (-2 if self.limit is None else self.limit))
+        seen.at_limit += int((at_limit & good).sum())
+        paid = now.r
         if self._ends is not None:
             failed = now.terminated & self._ends.failures.among(now.r, now.s)
             counts = failed if self._ends.end_reward < 0 else now.terminated & ~failed
             now = now._replace(r=now.r + self._ends.end_reward * counts)
         seen.truncated += int((now.truncated & ~now.terminated).sum())
         last = ends & ~now.terminated & (now.s_next < 0)  # truncated, or the episode just ends
+        kind = np.where(now.terminated, TERMINATED, np.where(last, CUT, KNOWN))
+        told, times = np.unique((3 * now.place + kind)[ends & (now.place >= 0)], return_counts=True)
+        seen.finals.update({divmod(x, 3): n for x, n in zip(told.tolist(), times.tolist(), strict=True)})
         s_next = np.where(now.terminated, then.s, now.s_next)
         out = now.terminated & (then.s < 0)
         if self._of_next_row:
@@ -264,12 +352,15 @@ class Rows:
             known = ~ends & (now.s_next >= 0) & (then.s >= 0)
             seen.gaps += int((known & (now.s_next != then.s)).sum())
         seen.last += int((last & good).sum())
-        seen.before_gaps += int((out & good).sum())
+        seen.before_gaps += int((out & good & ~at_limit).sum())
+        seen.ends_pay(paid[now.terminated & good & ~at_limit & ~out])
         # What was drawn, or taken, at the end of an episode was so in another state than s'.
         a_next = np.where(now.terminated, -1, now.a_next)
         if self._on_prior:
-            a_next = np.where((~ends | now.terminated) & (then.a >= 0), then.a, a_next)
-        return self._tuples(now, s_next, a_next, last | out, strict)
+            # Behind a gap the next row is in another state; s' of a truncated end is in no row.
+            follows = (~ends | now.terminated) & (s_next == then.s)
+            a_next = np.where(follows & (then.a >= 0), then.a, a_next)
+        return self._tuples(now, s_next, a_next, last | out | at_limit, strict)
 
     def _tuples(self, now: Block, s_next: np.ndarray, a_next: np.ndarray, out: np.ndarray, strict: bool) -> Batch:
         """The tuples of the rows ``now`` that are neither bad nor ``out`` [n] bool."""
@@ -287,7 +378,7 @@ class Rows:
         if (leave := bad | out).any():
             columns = tuple(column[~leave] for column in columns)
         s, a, r, s_next, a_next, x, weight = columns
-        self.seen.sum_of_rewards += float(r.sum())
+        self.seen.sum_of_rewards += float((r * SCALE).sum())
         batch = {"s": s, "a": a, "r": r, "s_next": s_next, "a_next": self._next_actions(s_next, a_next, x)}
         return batch | {"weight": weight} if "weight" in self._roles else batch
 
@@ -306,6 +397,34 @@ class Rows:
         columns = self._roles.get(role, (role,))
         own = "" if columns == (role,) else f" ({', '.join(columns)})"
         return f"{role}[{self._source.number(row)}]{own}"
+
+
+class _Places:
+    """How many steps rows are from the first of their episode; they come in blocks.
+
+    Args:
+        stride: of ``step`` from row to row; 0: rows are counted.
+    """
+
+    def __init__(self, stride: float) -> None:
+        self._stride, self._ended = stride, True
+        self._before = 0.0  # of the episode that goes on: its rows so far, or its first step
+
+    def of(self, begins: np.ndarray, ended: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """[n] int64 of a block: rows of another episode than the row before's, rows that end theirs, and steps."""
+        first = begins | np.append(self._ended, ended[:-1])
+        index = np.arange(len(first))
+        start = np.maximum.accumulate(np.where(first, index, -1))
+        if self._stride:
+            origin = np.where(start >= 0, step[start], self._before)
+            place = (step - origin) / self._stride
+            self._before = float(origin[-1])
+        else:
+            place = np.where(start >= 0, index - start, index + self._before)
+            self._before = float(place[-1] + 1)
+        self._ended = bool(ended[-1])
+        known = (place >= 0) & (place < 1 << 60)  # not of NaN
+        return np.where(known, np.rint(np.where(known, place, 0.0)), -1).astype(np.int64)
 
 
 class _Wrong:

@@ -188,7 +188,8 @@ class CsvFile(InOrder):
             with self._open() as stream:
                 head = stream.read(1 << 16)
             line = head.removeprefix(b"\xef\xbb\xbf").split(b"\n")[0]
-            self._delimiter = "\t" if file.name.lower().split(".")[-1] == "tsv" or ".tsv." in file.name.lower() else ","
+            tabs = {".tsv", ".tab"} & {suffix.lower() for suffix in file.suffixes[-2:]}
+            self._delimiter = "\t" if tabs else ","
             if b"," not in line and self._delimiter == ",":
                 self._delimiter = next((mark for mark in ";\t" if mark.encode() in line), ",")
             self.decimal_comma = self._delimiter == ";"

@@ -12,7 +12,7 @@ One update for all of them, with the step a_n = n(s,a)**-power, n(s,a) the visit
     ---------------  ---------  --------  -------------------------------  --------------------------------------------
     differential     soft       1         g += lr_rate a_n (td after)      average reward - KL(pi || pi0) / beta
     RVI              soft       1         V(reference)                     the same
-    U-learning       soft       1         averages exp(beta q) instead     the same, dynamics at the learner's choice
+    U-learning       soft       1         averages exp(beta q) instead     the same at optimism 1: control as inference
     soft Q           soft       < 1       0                                discounted sum of r - KL(pi || pi0) / beta
     Q                greedy     < 1       0                                discounted sum of r
     SARSA            on-policy  < 1       0                                discounted sum of r under its own pi
@@ -320,7 +320,9 @@ class RVISoftQ(ActionValueLearner):
 
 @dataclass(frozen=True, eq=False)
 class ULearning(_Average):
-    """U-learning: the optimistic problem, as biasing iteration 0 of Algorithm S1 poses it.
+    """U-learning: the optimistic problem, optimism 1 of the dial, as biasing iteration 0 of Algorithm S1 poses it.
+
+    ``AlgorithmS1(optimism=1)`` solves the same problem, by the listing's updates: b = 1 and delta = 0.
 
     Objective: reward rate - KL/beta where the *dynamics* too are at the learner's choice, at the price of their KL.
     Optimistic in stochastic dynamics, and only there: it averages u = exp(beta q), so that

@@ -9,7 +9,7 @@ This is U-learning of the process with one action a state, and runs in the same 
 
 Where it applies. The stream must come from the prior policy: z averages over its actions as they come (the other
 learners need only support). Todorov's optimal *dynamics*, p0 z(s')/<z>, is one that actions can make where each
-action leads to one state; with stochastic dynamics z is optimistic, as U-learning is.
+action leads to one state; with stochastic dynamics z is optimistic, as U-learning is: optimism 1 of the dial.
 
 The policy, for an MDP with actions: pi(a|s) ~ pi0(a|s) u(s,a), u(s,a) = the mean of exp(beta (r - g)) z(s') over the
 visits of (s,a) in the stream (one more table, made after each pass, not learnt from).
@@ -38,8 +38,9 @@ class ZState(ActionValueState):
 class ZLearning(_Average):
     """Z-learning, for streams from the prior policy; see the module's docstring.
 
-    Objective: that of U-learning, where the dynamics too are at the learner's choice. Optimistic in stochastic
-    dynamics; where every action leads to one state, the package's own objective.
+    Objective: that of U-learning, optimism 1 of the dial, where the dynamics too are at the learner's choice, at the
+    price of their KL. Optimistic in stochastic dynamics; where every action leads to one state, the package's
+    own objective.
 
     Args:
         lr_rate: step size of rho relative to that of z, in (0, 1]; None is 1 / S.

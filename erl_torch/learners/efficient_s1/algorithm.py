@@ -93,7 +93,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -353,7 +353,7 @@ class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
     takes_weights: ClassVar[bool] = True
 
     beta: float = 10.0
-    optimism: float = 0.0
+    optimism: float = field(default=0.0, kw_only=True)
     lr_u: float = 0.005
     lr_rho: float | None = None
     n_epochs: int = 3
@@ -716,13 +716,14 @@ class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
             for _ in range(1 if self.sample_mean_psi else self.max_psi_epochs):
                 before_x, before_y = x[visited], y[visited]
                 x[visited] = np.logaddexp(stream.log_keep + before_x, log_fresh + new_x)
-                if lam:  # of the logarithms of <psi^-lam>
-                    before, now = -lam * before_y, np.logaddexp(stream.log_keep - lam * before_y, log_fresh + new_y)
-                    y[visited], change = now / -lam, np.abs(np.expm1(now - before))
+                if lam:  # y is -log <psi^-lam> / lam
+                    y[visited] = np.logaddexp(stream.log_keep - lam * before_y, log_fresh + new_y) / -lam
                 else:
                     y[visited] = keep * before_y + (1 - keep) * new_y
-                    change = np.abs(y[visited] - before_y) / (np.abs(before_y) + LOG_PSI_EPSILON)
-                change = np.maximum(np.abs(np.expm1(x[visited] - before_x)), change)
+                change = np.maximum(
+                    np.abs(np.expm1((x[visited] - before_x) / (1.0 - lam or 1.0))),
+                    np.abs(y[visited] - before_y) / (np.abs(before_y) + LOG_PSI_EPSILON),
+                )
                 if self.sample_mean_psi or change.max() < self.psi_tol:
                     converged = True
                     break

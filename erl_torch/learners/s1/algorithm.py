@@ -83,7 +83,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
@@ -222,7 +222,7 @@ class AlgorithmS1(StreamLearner[S1State, S1Stream]):
     drawn_from_prior: ClassVar[str] = "a_next"
 
     beta: float = 10.0
-    optimism: float = 0.0
+    optimism: float = field(default=0.0, kw_only=True)
     lr_u: float = 0.005
     lr_rho: float | None = None
     lr_psi: float = 0.1

@@ -112,7 +112,7 @@ def power_phase(
             log_mean_psi[k] = _mixed(x, own[0, k], decay[k], 1.0 - optimism)
             change = max(change, abs(np.expm1(log_mean_psi[k] - x)))
             mean_log_psi[k] = _mixed(y, own[1, k], decay[k], -optimism)
-            change = max(change, abs(mean_log_psi[k] - y) / (abs(y) + epsilon))
+            change = max(change, abs(mean_log_psi[k] - y) / (epsilon + abs(y)))
         if not change >= tolerance:  # also leaves on NaN
             break
     return epochs, change

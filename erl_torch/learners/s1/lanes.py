@@ -538,7 +538,10 @@ class Engine:
         beta, optimism = self.beta[:, None, None], self.optimism[:, None, None]
         psi = state.psi_in_use
         g = gains(lanes.reward, state.reward_bias, state.mean_log_psi, psi, beta, self.prior, optimism)
-        scale = np.stack([gauge(*one) for one in zip(psi, self.optimism.tolist(), strict=True)])[:, :, None]
+        of_psi = psi
+        if optimism.any():
+            of_psi = np.stack([gauge(*one) for one in zip(psi, self.optimism.tolist(), strict=True)])
+        scale = of_psi[:, :, None]
         z = state.u * scale
         g, z = (x.reshape(len(self.replicas), self.n_pairs) for x in (g, z))
         q = 1 / state.rho
