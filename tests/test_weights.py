@@ -1,10 +1,11 @@
 """Other dynamics from the same tuples: weights, and dynamics that are given."""
 
+import re
 from dataclasses import fields
 
 import numpy as np
 import pytest
-from helpers import random_mdp, random_stream
+from helpers import ROOT, random_mdp, random_stream
 
 import erl_torch
 from erl_torch import (
@@ -472,3 +473,10 @@ def test_replicas_take_weights(setting):
         together = Replicas.of(make(BETA), optimism=[0.0, -1.0]).fit(weighted, 5, 3)
         for r, optimism in enumerate((0.0, -1.0)):
             assert together[r].theta == make(BETA, optimism=optimism).fit(weighted, 5, 3).theta
+
+
+def test_the_page_s_example_prints_what_the_page_says(capsys):
+    page = (ROOT / "docs" / "other-dynamics.md").read_text()
+    code, output = re.search(r"<!-- example: shift -->\n```python\n(.*?)```\n\n```text\n(.*?)```", page, re.S).groups()
+    exec(code, {})
+    assert capsys.readouterr().out == output
