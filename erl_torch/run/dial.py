@@ -19,13 +19,12 @@ from erl_torch.solvers.dial import slope
 from erl_torch.solvers.policy import policy_chain, reward_variance, stationary_distribution
 
 BETWEEN = 40  # values of optimism between the ends, at which the exact line is drawn
-BOARDS = 4  # policies that are shown
 LEARNT, EXACT, TANGENT = "#0072b2", "#222222", "#d55e00"
 PANELS = {
     "theta": "theta, reward per step",
     "reward": "reward per step",
     "falls": "falls per step",
-    "variance": "variance of the reward per step",
+    "variance": "long-run variance of rewards, per step",
 }
 
 
@@ -94,7 +93,7 @@ def dial_picture(
     for name in ("reward", "falls", "variance"):
         found[name] = [np.array([getattr(of, name) for of in each]) for each in worlds]
     shown = [name for name in PANELS if np.isfinite(line.figures[name]).any()]
-    boards = [] if grid is None else _spread([one.optimism for one in learnt])
+    boards = [] if grid is None else _shown([one.optimism for one in learnt])
     figure, axes, places = _layout(len(shown), len(boards), grid)
     figure.text(0.02, 1 - 0.3 / figure.get_figheight(), title, fontsize=11, weight="bold")
     caption = "dots: learnt, mean with quartiles; line: exact; dashed: slope of theta at optimism 0"
@@ -112,15 +111,12 @@ def dial_picture(
     return pictures.pixels(figure)
 
 
-def _spread(optimism: Sequence[float]) -> list[int]:
-    """Places of ``BOARDS`` values at most in the ascending ``optimism``: the ends, 0, and between."""
-    n = len(optimism)
-    chosen = set(np.linspace(0, n - 1, min(n, BOARDS)).round().astype(int).tolist())
-    zero = int(np.argmin(np.abs(optimism)))
-    if zero not in chosen:
-        inner = sorted(chosen - {0, n - 1}, key=lambda i: abs(i - zero))
-        chosen = chosen - set(inner[:1]) | {zero}
-    return sorted(chosen)
+def _shown(optimism: Sequence[float]) -> list[int]:
+    """Places in the ascending ``optimism`` whose boards are drawn: the lowest, what is nearest to 0, the first above
+    that, and what is nearest to 1."""
+    at = np.array(optimism)
+    zero = int(np.argmin(np.abs(at)))
+    return sorted({0, zero, min(zero + 1, len(at) - 1), int(np.argmin(np.abs(at - 1)))})
 
 
 def _layout(

@@ -26,6 +26,7 @@ MAX_STEPS = 200  # linear systems
 PATIENCE = 3  # states as narrow as the rewards allow, before the search for one as narrow as J allows ends
 
 
+@np.errstate(over="ignore", invalid="ignore")  # a value beyond double precision has infinite bounds
 def objective(
     transition: sp.csr_array,
     reward: np.ndarray,

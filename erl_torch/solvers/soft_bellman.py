@@ -60,6 +60,7 @@ def solve_soft_bellman(
     return solve_problem(problem, mdp, prior, tol, max_steps)
 
 
+@np.errstate(over="ignore", invalid="ignore")  # a value beyond double precision has infinite bounds
 def solve_problem(
     problem: BellmanProblem, mdp: Sized, prior_policy: ArrayLike | None = None, tol: float = 1e-10, max_steps: int = 200
 ) -> Solution:
