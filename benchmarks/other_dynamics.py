@@ -16,6 +16,7 @@ import os
 import sys
 import time
 import warnings
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +49,10 @@ from erl_torch.solvers.policy import objective  # noqa: E402
 BETA, SHAPE, OPTIMISMS = 2.0, (8, 3), (0.0, -1.0)
 T95 = 1.959964
 SHIFT_BETA = 15.0
+
+
+def _at(table: np.ndarray, s: np.ndarray, a: np.ndarray, s_next: np.ndarray) -> np.ndarray:
+    return np.asarray(table[s, a, s_next])
 
 
 def cases(rng: np.random.Generator, mdp: TabularMDP) -> dict[str, np.ndarray]:
@@ -102,7 +107,7 @@ def coverage(n: int, n_tuples: int, seed: int, to: Path) -> list[dict[str, Any]]
         data = noisy(collect(mdp, 1, n_tuples, 10_000 * seed + i), np.random.default_rng([seed, i]))
         known.append({"seed": [seed, n_tuples], "found": []})
         for (name, x), theta in exact.items():
-            weighted = reweighted(data, lambda s, a, t, ratio=ratios[name]: ratio[s, a, t])
+            weighted = reweighted(data, partial(_at, ratios[name]))
             estimate = theta_uncertainty(empirical_mdp(weighted, *SHAPE), BETA, optimism=x)
             low, high = estimate.interval()
             error = kish_error(weighted, x)

@@ -240,10 +240,9 @@ def test_random_logs(seed):
         for a, b in zip(rows, after, strict=True)
     ]
     if there["episode"] or there["terminated"] or there["truncated"]:
-        terminated = sum(there["terminated"] and row["terminated"] for row in rows)
-        truncated = sum(
-            there["truncated"] and row["truncated"] for row in rows if not (there["terminated"] and row["terminated"])
-        )
+        terminated = sum(bool(there["terminated"] and row["terminated"]) for row in rows)
+        cut = [row for row in rows if not (there["terminated"] and row["terminated"])]
+        truncated = sum(bool(there["truncated"] and row["truncated"]) for row in cut)
         assert (report.episodes, report.terminated, report.truncated) == (sum(ends), terminated, truncated)
         assert report.cut == sum(ends) - terminated - truncated >= 0
     if there["s_next"]:
@@ -1038,7 +1037,7 @@ def test_ends_that_nothing_counts_for(tmp_path, text, arguments, said):
 def test_the_end_of_a_bad_row_tells_nothing(tmp_path):
     """The best end, beside which others fail, is that of the rows that count."""
     path = tmp_path / "log.csv"
-    path.write_text(ENDS.replace("go,2,1", "go,0,1").replace("go,-1,1", "go,0,1") + ",go,9,1\n")
+    path.write_text(ENDS.replace("go,2,1", "go,1,1").replace("go,-1,1", "go,1,1") + ",go,9,1\n")
     with pytest.raises(InputError, match="no end is a failure"):
         read_log(path, on_bad="skip", end_reward=-3)
 

@@ -356,7 +356,7 @@ def test_weights_go_through_files(tmp_path, setting):
         Transitions.load(tmp_path / "tuples.npz"),
         read_experience(tmp_path / "tuples.npz", 5, 3),
         read_experience(tmp_path / "columns", 5, 3),
-        read_experience(tmp_path / "columns", 5, 3, chunk=1000).load(),
+        join(list(read_experience(tmp_path / "columns", 5, 3, chunk=1000).chunks())),
         read_log(tmp_path / "columns").experience,
         read_log(weighted.arrays()).experience,
     ):

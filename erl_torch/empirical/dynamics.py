@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from typing import overload
 
 import numpy as np
 import scipy.sparse as sp
@@ -37,6 +38,14 @@ REWARDS = ("pair", "successor")  # what a reward depends on
 NAMED = 5  # pairs in a message
 
 Ratio = Callable[[np.ndarray, np.ndarray, np.ndarray], ArrayLike]
+
+
+@overload
+def reweighted(experience: Transitions, ratio: Ratio) -> Transitions: ...
+
+
+@overload
+def reweighted(experience: Experience, ratio: Ratio) -> Experience: ...
 
 
 def reweighted(experience: Experience, ratio: Ratio) -> Experience:
