@@ -311,7 +311,7 @@ def test_any_error_keeps_what_was_learnt(tmp_path, monkeypatch, error, place, re
 
 
 def test_an_error_after_the_learning_keeps_it(tmp_path, monkeypatch):
-    def failing(*_):
+    def failing(*_, **__):
         raise MemoryError
 
     cfg = composed(*SMALL, *SHORT["s1"])
@@ -326,7 +326,7 @@ def test_an_error_after_the_learning_keeps_it(tmp_path, monkeypatch):
 
 
 def test_a_certificate_beyond_memory_is_named(tmp_path, monkeypatch):
-    def failing(*_):
+    def failing(*_, **__):
         raise MemoryError("SuperLU: not enough memory")
 
     monkeypatch.setattr("erl_torch.run.single.solve_soft_bellman", failing)

@@ -33,6 +33,7 @@ from erl_torch import (
 from erl_torch.empirical.counts import joint
 from erl_torch.envs import dynamics_shift
 from erl_torch.experience.experience import Selection, is_weighted
+from erl_torch.experience.transitions import join
 from erl_torch.learners.efficient_s1 import kernels
 
 BETA = 2.0
