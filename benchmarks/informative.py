@@ -12,6 +12,7 @@ import json
 import sys
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -23,8 +24,8 @@ from erl_torch.parallel import results
 
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
 PROBLEMS = {  # environment, beta, the width that is asked for
-    "windy cliff": ("erl_torch/WindyCliff-v0", 10.0, 0.004),
-    "river swim": ("erl_torch/RiverSwim-v0", 1.0, 0.004),
+    "windy cliff": ("erl_torch/WindyCliff-v0", 10.0, 0.0044),
+    "river swim": ("erl_torch/RiverSwim-v0", 1.0, 0.0021),
     "access control": ("erl_torch/AccessControl-v0", 2.0, 0.06),
     "windy maze": ("erl_torch/WindyMaze-v0", 10.0, 0.0006),
 }
@@ -50,11 +51,58 @@ def width(job: tuple[str, str, int, int]) -> tuple[float, bool]:
 
 
 def needed(widths: list[float], wanted: float) -> float:
-    """Tuples at which the median width is ``wanted``; NaN outside the sizes tried."""
+    """Tuples at which the median width is ``wanted``; infinite beyond the sizes tried, and at least the smallest."""
     x, y = np.log(np.array(EPISODES) * LENGTH), np.log(np.minimum.accumulate(widths))
-    if not y[-1] <= np.log(wanted) <= y[0]:
-        return float("nan")
+    if np.log(wanted) < y[-1]:
+        return float("inf")
     return float(np.exp(np.interp(np.log(wanted), y[::-1], x[::-1])))
+
+
+def _count(tuples: float) -> str:
+    smallest, largest = EPISODES[0] * LENGTH, EPISODES[-1] * LENGTH
+    return f"over {largest:,}" if np.isinf(tuples) else f"{'up to ' * (tuples < 1.001 * smallest)}{tuples:,.0f}"
+
+
+def page(record: dict[str, dict[str, Any]], seeds: int) -> str:
+    """docs/results/informative.md of the figures of every problem and way."""
+    lines, covered, ratios = [], [], []
+    for p, (_, beta, _) in PROBLEMS.items():
+        tuples = {}
+        for way in WAYS:
+            found = record[f"{p}, {way}"]
+            tuples[way] = needed(found["widths"], PROBLEMS[p][2])
+            row = " | ".join(f"{w:.2g}" for w in found["widths"])
+            lines.append(f"| {p}, beta {beta:g} | {way} | {row} | {_count(tuples[way])} |")
+            shares = " | ".join(f"{x:.2f}" for x in found["covered"])
+            covered.append(f"| {p} | {way} | {shares} | {np.mean(found['covered']):.3f} |")
+        least = min(tuples["prior"], EPISODES[-1] * LENGTH) / tuples["informative"]
+        ratios.append(f"{p} {'over ' if np.isinf(tuples['prior']) else ''}{least:.1f}")
+    asked = ", ".join(f"{p} {wanted:g}" for p, (_, _, wanted) in PROBLEMS.items())
+    heads = " | ".join(f"{n * LENGTH:,}" for n in EPISODES)
+    text = [
+        "# Which sample next",
+        "",
+        f"`python benchmarks/informative.py seeds={seeds}`: width of the 95% interval of theta (median over {seeds}",
+        "seeds) by the number of tuples, of the prior's behaviour and of `experience=informative`, and the tuples that",
+        f"a width takes ({asked}).",
+        "",
+        f"| problem | behaviour | {heads} | tuples for the width |",
+        "|---|---|" + "---|" * (len(EPISODES) + 1),
+        *lines,
+        "",
+        f"Fewer tuples by a factor of: {', '.join(ratios)}.",
+        "",
+        f"Share of the intervals that hold theta*, of {seeds} each:",
+        "",
+        f"| problem | behaviour | {heads} | all |",
+        "|---|---|" + "---|" * (len(EPISODES) + 1),
+        *covered,
+        "",
+        "An interval is of what was met. In the maze the informative policy does not look for more: one stream met 69 of",
+        "the 100 states in 40,000 tuples and in 320,000 (the prior's 63 and 78), and the narrower the interval, the more",
+        "often it leaves theta* out. A run notes how many states it has not met.",
+    ]
+    return "\n".join(text) + "\n"
 
 
 def main() -> None:
@@ -62,37 +110,18 @@ def main() -> None:
     seeds, processes = int(options.get("seeds", 20)), int(options.get("processes", 2))
     jobs = [(p, way, n, seed) for p in PROBLEMS for way in WAYS for n in EPISODES for seed in range(seeds)]
     found = dict(results({job: partial(width, job) for job in jobs}, processes))
-    lines, record = [], {}
-    for p, (_, beta, wanted) in PROBLEMS.items():
-        tuples = {}
+    record: dict[str, dict[str, Any]] = {}
+    for p in PROBLEMS:
         for way in WAYS:
             cells = [[found[p, way, n, seed] for seed in range(seeds)] for n in EPISODES]
-            widths = [float(np.median([w for w, _ in cell])) for cell in cells]
-            covered = float(np.mean([ok for cell in cells for _, ok in cell]))
-            tuples[way] = needed(widths, wanted)
-            record[f"{p}, {way}"] = {"widths": widths, "covered": covered, "tuples": tuples[way]}
-            row = " | ".join(f"{w:.2g}" for w in widths)
-            lines.append(f"| {p}, beta {beta:g} | {way} | {row} | {tuples[way]:,.0f} | {covered:.3f} |")
-        record[f"{p}, ratio"] = tuples["prior"] / tuples["informative"]
-    ratios = ", ".join(f"{p} {record[f'{p}, ratio']:.1f}" for p in PROBLEMS)
-    asked = ", ".join(f"{p} {wanted:g}" for p, (_, _, wanted) in PROBLEMS.items())
-    heads = " | ".join(f"{n * LENGTH:,}" for n in EPISODES)
-    text = [
-        "# Which sample next",
-        "",
-        f"`python benchmarks/informative.py seeds={seeds}`: width of the 95% interval of theta (median over {seeds}",
-        "seeds) by the number of tuples, of the prior's behaviour and of `experience=informative`; the tuples that a",
-        f"width takes ({asked}); and how often the intervals hold theta*, over all sizes and seeds.",
-        "",
-        f"| problem | behaviour | {heads} | tuples for the width | holds theta* |",
-        "|---|---|" + "---|" * (len(EPISODES) + 2),
-        *lines,
-        "",
-        f"Fewer tuples by a factor of: {ratios}.",
-    ]
-    (RESULTS / "informative.md").write_text("\n".join(text) + "\n")
+            record[f"{p}, {way}"] = {
+                "widths": [float(np.median([w for w, _ in cell])) for cell in cells],
+                "covered": [float(np.mean([ok for _, ok in cell])) for cell in cells],
+            }
+    text = page(record, seeds)
+    (RESULTS / "informative.md").write_text(text)
     (RESULTS / "informative.json").write_text(json.dumps(record, indent=1) + "\n")
-    print("\n".join(text))
+    print(text)
 
 
 if __name__ == "__main__":
