@@ -275,6 +275,39 @@ def test_bad_arguments_of_the_function(change, key):
     assert error.value.key == key
 
 
+@pytest.mark.parametrize(
+    "value",
+    [
+        None,
+        1.0,
+        "r",
+        [[0.0]],
+        np.zeros((4, 3)),
+        torch.tensor(0.0),
+        torch.zeros(3),
+        torch.zeros(4, 0),
+        torch.zeros(4, 3),
+    ],
+)
+@pytest.mark.parametrize("key", ["reward", "transition", "prior_policy"])
+def test_what_is_no_tensor_of_the_right_shape_is_refused_by_name(key, value):
+    """With the default prior too, which is made from the reward's shape; float32 is refused whatever the shape."""
+    r, p, prior = tensors(*random_problem(8))
+    tables = [value] if not isinstance(value, torch.Tensor) else [value, value.double()]
+    good = {"reward": (4, 3), "transition": (4, 3, 4), "prior_policy": ()}[key]  # a prior of zeros has no sum
+    for table in tables:
+        if key == "prior_policy" and table is None:
+            continue
+        if isinstance(table, torch.Tensor) and table.dtype == torch.float64 and table.shape == good:
+            continue
+        given = {"reward": r, "transition": p, "beta": 2.0} | {key: table}
+        for more in ({}, {"prior_policy": prior}):
+            with pytest.raises(InputError) as error:
+                soft_bellman(**(more | given))
+            assert error.value.key.startswith(key)
+            assert "\n" not in str(error.value)
+
+
 def test_a_problem_without_a_solution_is_refused_by_its_status():
     stay = torch.eye(2, dtype=torch.float64)[:, None, :].expand(2, 2, 2)
     with pytest.raises(InputError, match="REDUCIBLE"):
