@@ -507,6 +507,16 @@ def test_errors_are_numbers_at_the_ends_of_pseudo_count(pseudo_count):
         assert fit.weights == pytest.approx(np.zeros(3), abs=1e-7)
 
 
+def test_a_difference_that_rounding_hides_is_no_identified_weight():
+    """Two features that differ by 1e-8: their information by 1e-16 of the sum's. Together they are one, told."""
+    mdp, features, w, policy = linear_problem(6)
+    twins = np.stack([features[:, :, 0], features[:, :, 0] + 1e-8 * features[:, :, 1], features[:, :, 2]], 2)
+    fit = fit_reward(np.round(200 * policy(w)), twins, mdp=mdp, beta=2.0)
+    assert fit.identified.tolist() == [False, False, True]
+    assert np.isinf(fit.standard_error).tolist() == [True, True, False]
+    assert "0, 1 is lost in rounding" in fit.message
+
+
 @pytest.mark.parametrize("optimism", [0.0, 1.0])
 def test_a_likelihood_without_a_maximum_is_said_to_have_none(optimism):
     """Every finite table leaves each action a chance, so that an expert who never takes one is only approached."""

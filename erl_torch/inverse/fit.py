@@ -71,10 +71,9 @@ class RewardFit:
     gap: float  # what pi_E loses by ``reward``: mean KL(pi_E || pi) / beta over its flow, reward per step
     log_likelihood: float  # mean of log(pi/prior) over the demonstrations, nats per step
     n_steps: float  # demonstrated; infinite where the policy was exact
-    converged: (
-        bool  # the flows of features differ by ``tol`` of each feature's size at most, the penalty counted; False
-    )
-    # where the likelihood is seen to rise without end
+    # The flows of features differ by ``tol`` of each feature's size at most, the penalty counted, and the likelihood is
+    # not seen to rise without end:
+    converged: bool
     message: str
     names: tuple[str, ...]
 
@@ -146,13 +145,15 @@ def fit_reward(
     weights, at, converged = _maximise(objective, tol, max_iterations)
     space = _directions(objective, at)
     told, hidden = space.told, space.hidden
-    away = _away(objective, weights, at)
+    refused = features is None and penalty == 0 and objective.refuses()  # a table explains that only in the limit
+    away = RISES if refused else _away(objective, weights, at)
     if optimism == 0:  # shaping, which changes nothing at all
         weights = told @ (told.T @ weights)
     solution = objective.solve(objective.problem(weights))
     eigenvalues, error, lost = _information(objective, at, space)
-    no_maximum = away == RISES or (features is None and penalty == 0 and objective.refuses())
-    converged = converged and not no_maximum
+    converged = converged and away != RISES
+    rounded = [labels[k] for k in np.flatnonzero(lost & space.own)]
+    told_of = [*_maximum_told(converged, away), *_directions_told(hidden, rounded, bool(away))]
     seen = (expert.weight if expert.exact else expert.counts).ravel() > 0
     unmet = tuple(np.flatnonzero(~(table[seen] != 0).any(0)).tolist())
     return RewardFit(
@@ -168,16 +169,7 @@ def fit_reward(
         log_likelihood=float((expert.weight * at.log_ratio).sum()),
         n_steps=np.inf if expert.exact else expert.n_steps,
         converged=converged,
-        message=_message(
-            given,
-            expert,
-            solution,
-            [labels[k] for k in unmet],
-            [
-                *_maximum_told(converged, RISES if no_maximum else away),
-                *_directions_told(hidden, [labels[k] for k in np.flatnonzero(lost & space.own)], bool(away)),
-            ],
-        ),
+        message=_message(given, expert, solution, [labels[k] for k in unmet], told_of),
         names=labels,
     )
 
@@ -482,9 +474,8 @@ def _maximum_told(converged: bool, away: str) -> list[str]:
 def _directions_told(hidden: np.ndarray, lost: list[str], away: bool) -> list[str]:
     parts = []
     if hidden.shape[1]:
-        parts.append(
-            f"{hidden.shape[1]} of {len(hidden)} directions of the weights change no behaviour{' out there' * away}"
-        )
+        where = " out there" if away else ""
+        parts.append(f"{hidden.shape[1]} of {len(hidden)} directions of the weights change no behaviour{where}")
     if lost:
         parts.append(f"what tells {_listed(lost)} is lost in rounding: no error")
     return parts
