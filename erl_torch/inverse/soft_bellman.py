@@ -166,6 +166,10 @@ def _rows(
     checks.instance("pattern", pattern, sp.csr_array, "a csr_array of scipy's")
     if pattern.shape != shape:
         raise InputError("pattern", f"a matrix of shape {pattern.shape}", f"of shape {list(shape)} ([S*A, S])")
+    try:
+        pattern.check_format(full_check=True)
+    except ValueError as error:
+        raise InputError("pattern", "a sparse matrix", f"one with indices in range ({error})") from error
     data = checks.array("transition", transition, (len(pattern.indices),), _ANY)
     pair = np.repeat(np.arange(shape[0]), np.diff(pattern.indptr))
     sums = np.bincount(pair, data, shape[0])
