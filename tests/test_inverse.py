@@ -308,6 +308,15 @@ def test_what_is_no_tensor_of_the_right_shape_is_refused_by_name(key, value):
             assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize("part", ["indices", "indptr"])
+def test_a_pattern_that_is_no_matrix_is_refused(part):
+    reward, p, _ = random_problem(8)
+    pattern = sp.csr_array(p.reshape(12, 4))
+    setattr(pattern, part, pattern.indices + 4 if part == "indices" else pattern.indptr[:-2])
+    with pytest.raises(InputError, match="^pattern"):
+        soft_bellman(torch.from_numpy(reward), torch.from_numpy(p.ravel()), beta=2.0, pattern=pattern)
+
+
 def test_a_problem_without_a_solution_is_refused_by_its_status():
     stay = torch.eye(2, dtype=torch.float64)[:, None, :].expand(2, 2, 2)
     with pytest.raises(InputError, match="REDUCIBLE"):
