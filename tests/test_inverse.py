@@ -313,7 +313,7 @@ def test_a_pattern_that_is_no_matrix_is_refused(part):
     reward, p, _ = random_problem(8)
     pattern = sp.csr_array(p.reshape(12, 4))
     setattr(pattern, part, pattern.indices + 4 if part == "indices" else pattern.indptr[:-2])
-    with pytest.raises(InputError, match="^pattern"):
+    with pytest.raises(InputError, match=r"^pattern"):
         soft_bellman(torch.from_numpy(reward), torch.from_numpy(p.ravel()), beta=2.0, pattern=pattern)
 
 
