@@ -262,8 +262,10 @@ def flag(key: str, value: object) -> bool:
 
 
 def sequence(key: str, value: object) -> tuple[Any, ...]:
-    """``value`` as a tuple. Raises InputError unless it is a list, an array or the like."""
+    """``value`` as a tuple. Raises InputError unless it is a list, an array or the like; bytes are none."""
     try:
+        if isinstance(value, (bytes, bytearray, memoryview)):  # their entries would be numbers
+            raise TypeError
         return tuple(value)  # type: ignore[arg-type]  # TypeError for what has no entries
     except (TypeError, RuntimeError) as error:
         raise InputError(key, f"{_text(value)} ({type(value).__name__})", "a list") from error

@@ -436,3 +436,9 @@ def test_a_single_run_goes_on_with_the_same_bits(tmp_path, optimism):
     files = [(tmp_path / name / "solution.npz").read_bytes() for name in ("whole", "cut")]
     assert files[0] == files[1]
     assert Solution.load(tmp_path / "whole/solution.npz").optimism == optimism
+
+
+@pytest.mark.parametrize("values", [b"1", bytearray(b"1"), memoryview(b"1")])
+def test_bytes_are_no_list_of_numbers(values):
+    with pytest.raises(InputError, match="optimism"):
+        Replicas.of(AlgorithmS1(), optimism=values)

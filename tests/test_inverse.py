@@ -275,6 +275,48 @@ def test_bad_arguments_of_the_function(change, key):
     assert error.value.key == key
 
 
+@pytest.mark.parametrize(
+    "value",
+    [
+        None,
+        1.0,
+        "r",
+        [[0.0]],
+        np.zeros((4, 3)),
+        torch.tensor(0.0),
+        torch.zeros(3),
+        torch.zeros(4, 0),
+        torch.zeros(4, 3),
+    ],
+)
+@pytest.mark.parametrize("key", ["reward", "transition", "prior_policy"])
+def test_what_is_no_tensor_of_the_right_shape_is_refused_by_name(key, value):
+    """With the default prior too, which is made from the reward's shape; float32 is refused whatever the shape."""
+    r, p, prior = tensors(*random_problem(8))
+    tables = [value] if not isinstance(value, torch.Tensor) else [value, value.double()]
+    good = {"reward": (4, 3), "transition": (4, 3, 4), "prior_policy": ()}[key]  # a prior of zeros has no sum
+    for table in tables:
+        if key == "prior_policy" and table is None:
+            continue
+        if isinstance(table, torch.Tensor) and table.dtype == torch.float64 and table.shape == good:
+            continue
+        given = {"reward": r, "transition": p, "beta": 2.0} | {key: table}
+        for more in ({}, {"prior_policy": prior}):
+            with pytest.raises(InputError) as error:
+                soft_bellman(**(more | given))
+            assert error.value.key.startswith(key)
+            assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("part", ["indices", "indptr"])
+def test_a_pattern_that_is_no_matrix_is_refused(part):
+    reward, p, _ = random_problem(8)
+    pattern = sp.csr_array(p.reshape(12, 4))
+    setattr(pattern, part, pattern.indices + 4 if part == "indices" else pattern.indptr[:-2])
+    with pytest.raises(InputError, match=r"^pattern"):
+        soft_bellman(torch.from_numpy(reward), torch.from_numpy(p.ravel()), beta=2.0, pattern=pattern)
+
+
 def test_a_problem_without_a_solution_is_refused_by_its_status():
     stay = torch.eye(2, dtype=torch.float64)[:, None, :].expand(2, 2, 2)
     with pytest.raises(InputError, match="REDUCIBLE"):
@@ -440,6 +482,80 @@ def test_scale_of_features_does_not_matter_to_what_is_told():
     assert fit.weights * scale == pytest.approx(w, abs=1e-6)
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("optimism", [0.0, 1.0])
+@pytest.mark.parametrize("scale", [[1e-90] * 3, [1e90] * 3, [1e8, 1.0, 1e-8], [1e90, 1e-90, 1.0]])
+def test_weights_and_errors_are_in_the_units_of_features(scale, optimism):
+    """Features times c: weights / c and errors / c, the same likelihood, policy and loss; nothing gets lost."""
+    mdp, features, w, policy = linear_problem(6)
+    counts = np.round(200 * policy(w, optimism=optimism))
+
+    def fit(features):
+        return fit_reward(counts, features, mdp=mdp, beta=2.0, optimism=optimism)
+
+    one, other = fit(features), fit(features * np.array(scale))
+    assert other.weights * scale == pytest.approx(one.weights, rel=1e-6)
+    assert other.standard_error * scale == pytest.approx(one.standard_error, rel=1e-6)
+    assert other.log_likelihood == pytest.approx(one.log_likelihood, abs=1e-12)
+    assert other.gap == pytest.approx(one.gap, abs=1e-9)
+    assert (one.identified & other.identified).all()
+    assert one.message == other.message == ""
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("pseudo_count", [1e-100, 1e100])
+def test_errors_are_numbers_at_the_ends_of_pseudo_count(pseudo_count):
+    """One step alone; where the prior outweighs it, the fit is the prior, and its weights are 0."""
+    mdp, features, _, _ = linear_problem(6)
+    counts = np.zeros((6, 3))
+    counts[2, 1] = 1.0
+    fit = fit_reward(counts, features, mdp=mdp, beta=2.0, pseudo_count=pseudo_count)
+    assert (fit.standard_error >= 0).all()
+    assert (np.isfinite(fit.standard_error) | ~fit.identified).all()
+    if pseudo_count > 1:
+        assert fit.weights == pytest.approx(np.zeros(3), abs=1e-7)
+
+
+def test_a_difference_that_rounding_hides_is_no_identified_weight():
+    """Two features that differ by 1e-8: their information by 1e-16 of the sum's. Together they are one, told."""
+    mdp, features, w, policy = linear_problem(6)
+    twins = np.stack([features[:, :, 0], features[:, :, 0] + 1e-8 * features[:, :, 1], features[:, :, 2]], 2)
+    fit = fit_reward(np.round(200 * policy(w)), twins, mdp=mdp, beta=2.0)
+    assert fit.identified.tolist() == [False, False, True]
+    assert np.isinf(fit.standard_error).tolist() == [True, True, False]
+    assert "0, 1 is lost in rounding" in fit.message
+
+
+@pytest.mark.parametrize("optimism", [0.0, 1.0])
+def test_a_likelihood_without_a_maximum_is_said_to_have_none(optimism):
+    """Every finite table leaves each action a chance, so that an expert who never takes one is only approached."""
+    mdp = linear_problem(10)[0]
+    expert = np.eye(3)[[0, 1, 2, 0, 1, 2]]
+    fit = fit_reward(expert, mdp=mdp, beta=2.0, exact=True, optimism=optimism)
+    assert not fit.converged
+    assert "no maximum" in fit.message
+    assert "penalty" in fit.message
+    kept = fit_reward(expert, mdp=mdp, beta=2.0, exact=True, penalty=1e-3, optimism=optimism)
+    assert kept.converged
+    assert "maximum" not in kept.message
+    counted = fit_reward(10 * expert, mdp=mdp, beta=2.0, optimism=optimism)  # the pseudo-counts keep them too
+    assert "no maximum" not in counted.message
+
+
+def test_a_single_feature_whose_weight_runs_away_is_named_so():
+    """An action that is never taken, and a feature that marks it: the larger its cost, the likelier."""
+    mdp, features, w, policy = linear_problem(6)
+    expert = policy(w)
+    expert[:, 2] = 0.0
+    marks = np.zeros((6, 3, 1))
+    marks[:, 2] = 1e3
+    expert /= expert.sum(1, keepdims=True)
+    fit = fit_reward(expert, np.concatenate([features, marks], 2), mdp=mdp, beta=2.0, exact=True)
+    assert not fit.converged or "level" in fit.message
+    assert "penalty" in fit.message
+    assert fit.weights[3] * 1e3 < -5
+
+
 def test_only_the_share_of_actions_in_a_state_enters():
     """Cut, shuffled, and visited as one likes: the same policy, the same weights; the errors differ."""
     mdp, features, w, policy = linear_problem(7)
@@ -524,6 +640,12 @@ def test_a_policy_that_is_taken_for_counts_is_noted():
         (dict(beta=-1.0), "beta"),
         (dict(penalty=-1.0), "penalty"),
         (dict(pseudo_count=0.0), "pseudo_count"),
+        (dict(pseudo_count=1e-300), "pseudo_count"),
+        (dict(pseudo_count=1e300), "pseudo_count"),
+        (dict(penalty=1e300, features=np.full((6, 1), 1e-90)), "penalty"),
+        (dict(features=np.full((6, 1), 1e200)), "features"),
+        (dict(features=np.full((6, 1), 1e-200)), "features"),
+        (dict(demonstrations=np.full((6, 3), 1e300)), "demonstrations[0, 0]"),
         (dict(features=np.zeros((6, 2, 3))), "features"),
         (dict(features=np.full((6, 1), np.nan)), "features[0, 0]"),
         (dict(names=["one"]), "names"),

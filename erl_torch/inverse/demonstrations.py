@@ -17,6 +17,8 @@ from erl_torch.notes import note
 from erl_torch.solvers.chains import long_run
 from erl_torch.solvers.problem import BellmanProblem
 
+COUNTS: checks.Entries = (lambda x: (x >= 0) & (x <= 1e100), "0 to 1e100")  # sums and squares stay in double precision
+
 
 class Setting(NamedTuple):
     """A problem without rewards, on the states and pairs that take part."""
@@ -86,7 +88,7 @@ def demonstrated(
         kept = permitted(demonstrations, prior, next_actions=False, told=note)
         counts = tally(kept, *prior.shape).visits.reshape(prior.shape).astype(np.float64)
     else:
-        counts = checks.array("demonstrations", demonstrations, prior.shape, checks.NOT_NEGATIVE)
+        counts = checks.array("demonstrations", demonstrations, prior.shape, COUNTS)
         if not exact and counts.sum() < len(counts) + 0.5 and (counts != np.floor(counts)).any():
             note("demonstrations are taken as counts of less than a step a state: a policy, or shares, need exact=True")
     total = counts.sum()

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -45,6 +46,11 @@ SHARED = ("pattern", "elimination", "classes")  # of problems that differ in the
 MUCH_UNSEEN = 1e-3  # of the expert's time
 PART = 1e-6  # of a feature that may lie in directions that are not told
 SMALL = 1e-14  # eigenvalues of the information, relative to the largest, that rounding hides
+SIZES = (1e-100, 1e100)  # of a feature, and of pseudo_count: within, squares stay in double precision
+WEAK = 1e-6  # information of a step about beta times a feature's size times its weight, nats
+LEVEL = 1e-9  # nats a step: a likelihood that falls by less is level
+RISES, LEVELS = "rises", "level"
+RISE = 1e-12  # nats a step, above what rounding makes of a likelihood
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -57,7 +63,7 @@ class RewardFit:
     weights: np.ndarray  # [F], reward; no part in ``unidentified``
     reward: np.ndarray  # [S, A], sum_k w_k phi_k; of a table 0 in pairs that take no part
     standard_error: np.ndarray | None  # of the told part of ``weights``, [F]; infinite without, None where exact
-    identified: np.ndarray  # [F] bool: whether the weight itself is, not only a combination of it with others
+    identified: np.ndarray  # [F] bool: whether the weight itself is, not only a combination; its error is finite
     unidentified: np.ndarray  # [F, k], orthonormal columns: w plus any of them explains the behaviour as well
     eigenvalues: np.ndarray  # of the information of one step about the other directions, ascending, 1/reward^2
     unmet: tuple[int, ...]  # features that are 0 in all that was demonstrated
@@ -65,7 +71,9 @@ class RewardFit:
     gap: float  # what pi_E loses by ``reward``: mean KL(pi_E || pi) / beta over its flow, reward per step
     log_likelihood: float  # mean of log(pi/prior) over the demonstrations, nats per step
     n_steps: float  # demonstrated; infinite where the policy was exact
-    converged: bool  # the flows of features differ by ``tol`` of each feature's size at most, the penalty counted
+    # The flows of features differ by ``tol`` of each feature's size at most, the penalty counted, and the likelihood is
+    # not seen to rise without end:
+    converged: bool
     message: str
     names: tuple[str, ...]
 
@@ -101,13 +109,14 @@ def fit_reward(
     Args:
         demonstrations: tuples, of which s and a count (their order, rewards and a' do not); or a table [S, A] of counts
             n(s, a), or with ``exact`` of a policy, or of shares of pairs: proportions within a row are the policy.
-        features: [S, A, F], or [S, F] of the state alone; None: each pair is one, the reward is a table.
+        features: [S, A, F], or [S, F] of the state alone, the largest value of each 0 or of size 1e-100 to 1e100;
+            None: each pair is one, the reward is a table.
         mdp: the model, whose rewards are ignored; or counts of tuples, the expert's or others', as of
             ``empirical_mdp``.
         beta: inverse temperature of the expert, 1/reward. Only beta times the reward is told.
         prior_policy: [S, A], 0 where an action is not to be taken; None is uniform over the actions of each state.
         penalty: >= 0, 1/reward^2, of |w|^2 / 2, taken from the log-likelihood of one step.
-        pseudo_count: > 0, steps of the prior that are added to those of each state.
+        pseudo_count: 1e-100 to 1e100, steps of the prior that are added to those of each state.
         exact: the table is the expert's policy itself, of infinitely many steps.
         names: [F], of the features; None: numbers, or pairs.
         tol: of the gradient: difference of mean features, each in units of its largest value.
@@ -125,7 +134,8 @@ def fit_reward(
     if checks.optimism("optimism", optimism, beta) < 0:
         raise InputError("optimism", optimism, ">= 0: below 0 not even the rate is a convex function of the reward")
     penalty = checks.number("penalty", penalty, lambda x: 0 <= x < np.inf, "a finite number >= 0")
-    checks.positive("pseudo_count", pseudo_count)
+    low, high = SIZES
+    pseudo_count = checks.number("pseudo_count", pseudo_count, lambda x: low <= x <= high, f"{low:g} to {high:g}")
     checks.positive("tol", tol)
     checks.at_least("max_iterations", max_iterations, 1)
     given = setting(mdp, beta, prior_policy, optimism)
@@ -133,18 +143,24 @@ def fit_reward(
     table, labels = _features(features, given, names)
     objective = _Objective(given, expert, table, penalty)
     weights, at, converged = _maximise(objective, tol, max_iterations)
-    told, hidden = _directions(objective, at)
+    space = _directions(objective, at)
+    told, hidden = space.told, space.hidden
+    refused = features is None and penalty == 0 and objective.refuses()  # a table explains that only in the limit
+    away = RISES if refused else _away(objective, weights, at)
     if optimism == 0:  # shaping, which changes nothing at all
         weights = told @ (told.T @ weights)
     solution = objective.solve(objective.problem(weights))
-    eigenvalues, error = _information(objective, at, told)
+    eigenvalues, error, lost = _information(objective, at, space)
+    converged = converged and away != RISES
+    rounded = [labels[k] for k in np.flatnonzero(lost & space.own)]
+    told_of = [*_maximum_told(converged, away), *_directions_told(hidden, rounded, bool(away))]
     seen = (expert.weight if expert.exact else expert.counts).ravel() > 0
     unmet = tuple(np.flatnonzero(~(table[seen] != 0).any(0)).tolist())
     return RewardFit(
         weights=weights,
         reward=_reward(features, given, table, weights),
         standard_error=error,
-        identified=np.sqrt((hidden**2).sum(1)) < PART,
+        identified=space.own & ~lost,
         unidentified=hidden,
         eigenvalues=eigenvalues,
         unmet=unmet,
@@ -153,7 +169,7 @@ def fit_reward(
         log_likelihood=float((expert.weight * at.log_ratio).sum()),
         n_steps=np.inf if expert.exact else expert.n_steps,
         converged=converged,
-        message=_message(given, expert, hidden, [labels[k] for k in unmet], converged, solution),
+        message=_message(given, expert, solution, [labels[k] for k in unmet], told_of),
         names=labels,
     )
 
@@ -164,6 +180,7 @@ def _features(
     """(features of the problem's pairs [n*A, F], 0 where the prior is 0; their names)."""
     problem, there = given.problem, given.problem.prior > 0
     n_states, n_actions = given.prior.shape
+    low, high = SIZES
     if features is None:
         pairs = np.argwhere(there)
         checks.room("features", (there.size, len(pairs)))
@@ -174,6 +191,10 @@ def _features(
         whole = _every_pair(features, n_states, n_actions)
         table = np.where(there[:, :, None], whole[problem.states], 0.0).reshape(there.size, -1)
         labels = tuple(map(str, range(table.shape[1])))
+        sizes = np.abs(table).max(0)
+        if (odd := np.flatnonzero((sizes != 0) & ((sizes < low) | (sizes > high)))).size:
+            k = int(odd[0])
+            raise InputError("features", f"one (number {k}) of size {sizes[k]:g}", f"0, or of size {low:g} to {high:g}")
     if names is not None:
         labels = checks.sequence("names", names)
         for name in labels:
@@ -210,9 +231,18 @@ class _Objective:
         self.scale = np.abs(features).max(0)
         self.scale[self.scale == 0] = 1.0
         self.features = features / self.scale
-        self.stiffness = penalty / (self.base.beta * self.scale) ** 2
+        with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+            self.stiffness = np.sqrt(penalty) / (self.base.beta * self.scale)
+            self.stiffness = self.stiffness**2
+        if not np.isfinite(self.stiffness).all():
+            raise InputError("penalty", penalty, "less: in units of beta times the features it leaves double precision")
         self._aim = self.features.T @ expert.flow.ravel()
         self._value: np.ndarray | None = None
+
+    def refuses(self) -> bool:
+        """Whether the expert never takes an action that it may take, in a state where it spends time."""
+        expert, there = self.expert, self.base.prior > 0
+        return bool(((expert.policy == 0) & there & (expert.weight.sum(1, keepdims=True) > 0)).any())
 
     def weights(self, x: np.ndarray) -> np.ndarray:
         return np.asarray(x / (self.base.beta * self.scale))
@@ -331,39 +361,98 @@ def _squares(at: Linearised, advantages: np.ndarray, share: np.ndarray) -> np.nd
     return np.asarray(advantages.T @ (weight[:, None] * advantages))
 
 
-def _directions(objective: _Objective, at: Linearised) -> tuple[np.ndarray, np.ndarray]:
-    """Orthonormal columns of the directions of the weights [F] that behaviour tells, and of those that it does not."""
+class _Space(NamedTuple):
+    """What behaviour tells of the weights, and what it does not."""
+
+    told: np.ndarray  # [F, r], orthonormal columns: the rest of ``hidden``
+    hidden: np.ndarray  # [F, k], orthonormal columns
+    basis: np.ndarray  # [F, r]: coordinates of what is told, to weights times the features' sizes
+    part: np.ndarray  # [F, r]: the same, to the part of the weights in ``told``, times the features' sizes
+    own: np.ndarray  # [F] bool: whether the weight has no part in ``hidden``
+
+
+def _directions(objective: _Objective, at: Linearised) -> _Space:
+    """What behaviour tells of the weights; the rank is asked of features divided by their sizes."""
     scaled = _advantages(objective, at)[objective.base.prior.ravel() > 0]
     n_pairs, n_features = scaled.shape
     _, sizes, axes = np.linalg.svd(scaled, full_matrices=n_features > n_pairs)
     rank = int((sizes > max(TOLD * sizes[0], 1e-300)).sum())
-    whole = np.linalg.qr((axes[rank:] / objective.scale).T, mode="complete")[0]
-    return whole[:, n_features - rank :], whole[:, : n_features - rank]
+    own = np.sqrt((axes[rank:] ** 2).sum(0)) < PART
+    scale = objective.scale
+    if rank == n_features:  # the features themselves are coordinates, and no sizes mix
+        basis = np.eye(n_features)
+        return _Space(basis, np.zeros((n_features, 0)), basis, basis, own)
+    whole = np.linalg.qr((axes[rank:] * (scale.min() / scale)).T, mode="complete")[0]
+    told, hidden = whole[:, n_features - rank :], whole[:, : n_features - rank]
+    basis = axes[:rank].T
+    part = basis - scale[:, None] * (hidden @ (hidden.T @ (basis / scale[:, None])))
+    return _Space(told, hidden, basis, part, own)
 
 
-def _information(objective: _Objective, at: Linearised, told: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-    """(eigenvalues of a step's information about the directions ``told``, standard errors of the weights [F]).
+def _information(
+    objective: _Objective, at: Linearised, space: _Space
+) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
+    """(eigenvalues of a step's information about the directions told, standard errors of the weights [F], [F] bool:
+    whether a weight has a part in directions that are told by less than rounding leaves).
 
     With h the weight of a state in the objective, its second derivative is -H, H = beta^2 sum_s h E A A', and the
     variance of its first that of the expert's actions, beta^2 sum_s h^2 E A A' / n(s): the errors are those of
-    H^-1 (...) H^-1, which is the inverse of the Fisher information where steps fall as h does.
+    H^-1 (...) H^-1, which is the inverse of the Fisher information where steps fall as h does. Coordinates are divided
+    by the roots of H's diagonal, so that rounding is the same on every scale of features.
     """
-    expert, beta = objective.expert, objective.base.beta
-    share = objective.share(at)
-    advantages = beta * (_advantages(objective, at) * objective.scale) @ told
-    sizes, axes = np.linalg.eigh(_squares(at, advantages, share))
+    expert, beta, scale = objective.expert, objective.base.beta, objective.scale
+    share, whole = objective.share(at), _advantages(objective, at)
+    with np.errstate(over="ignore"):
+        sizes = np.linalg.eigvalsh(_squares(at, beta * (whole * (scale / scale.max())) @ space.told, share))
+        sizes = sizes * scale.max() ** 2
+    advantages = whole @ space.basis
+    plain = _squares(at, advantages, share)
+    unit = np.sqrt(np.diag(plain))
+    unit[unit == 0] = 1.0
+    stiff = space.part / unit
+    plain = plain / np.outer(unit, unit)
+    known_sizes, axes = np.linalg.eigh(plain)
+    known = known_sizes > SMALL * max(known_sizes.max(initial=0.0), 0.0)
+    part = stiff @ axes
+    lost = _share_of(part, ~known) > PART
     if expert.exact:
-        return sizes, None
+        return sizes, None, lost
     visits = expert.counts.sum(1)
-    reach = share**2 * visits / (visits + expert.pseudo_count) ** 2
-    known = sizes > SMALL * sizes[-1] if len(sizes) else np.zeros(0, bool)
-    inverse = 1.0 / np.where(known, sizes + objective.penalty, np.inf)
-    spread = told @ (axes * inverse)
-    variance = np.einsum("fi,ij,fj->f", spread, axes.T @ _squares(at, advantages, reach) @ axes, spread)
-    error = np.sqrt(np.maximum(variance, 0.0))
-    lost = np.sqrt(((told @ axes[:, ~known]) ** 2).sum(1)) > PART
-    untold = np.sqrt((told**2).sum(1)) < PART
-    return sizes, np.where(lost | untold, np.inf, error)
+    reach = share**2 * (visits / (visits + expert.pseudo_count)) / (visits + expert.pseudo_count)
+    kept = part[:, known]
+    second = np.diag(known_sizes[known]) + kept.T @ (objective.stiffness[:, None] * kept)
+    spread = np.linalg.solve(second, kept.T).T
+    turned = axes[:, known]
+    noise = turned.T @ (_squares(at, advantages, reach) / np.outer(unit, unit)) @ turned
+    variance = np.einsum("fi,ij,fj->f", spread, noise, spread)
+    error = np.sqrt(np.maximum(variance, 0.0)) / (beta * scale)
+    untold = np.sqrt((space.part**2).sum(1)) < PART
+    return sizes, np.where(lost | untold | ~np.isfinite(error), np.inf, error), lost | (space.own & ~np.isfinite(error))
+
+
+def _share_of(part: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """Share of each row of ``part`` that is in columns ``chosen``, [F]; 0 for a row of zeros."""
+    whole = np.sqrt((part**2).sum(1))
+    return np.asarray(np.sqrt((part[:, chosen] ** 2).sum(1)) / np.where(whole > 0, whole, 1.0))
+
+
+def _away(objective: _Objective, weights: np.ndarray, at: Linearised) -> str:
+    """Whether the objective still rises, or is level, where what is hardly told of the weights is doubled; "" if not.
+
+    Weights that run away stop where the gradient is lost in rounding. What is not told at all stays at 0 meanwhile.
+    """
+    x = weights * objective.base.beta * objective.scale
+    information = _squares(at, _advantages(objective, at), objective.share(at)) + np.diag(objective.stiffness)
+    sizes, axes = np.linalg.eigh(information)
+    weak = axes[:, sizes < WEAK]
+    more = weak @ (weak.T @ x)
+    if np.abs(more).max(initial=0.0) < 1:
+        return ""
+    there = objective.at(x + more)
+    if there is None:
+        return ""
+    change = objective.evaluate(x + more, there)[0] - objective.evaluate(x, at)[0]
+    return RISES if change > RISE else LEVELS if change > -LEVEL else ""
 
 
 def _divergence(policy: np.ndarray, at: Linearised) -> np.ndarray:
@@ -374,18 +463,33 @@ def _divergence(policy: np.ndarray, at: Linearised) -> np.ndarray:
     return np.asarray(np.maximum(terms.sum(1), 0.0))
 
 
-def _message(
-    given: Setting, expert: Demonstrated, hidden: np.ndarray, unmet: list[str], converged: bool, solution: Solution
-) -> str:
-    """What to know of the fit, in one line; "" where there is nothing."""
-    parts = [given.message] if given.message else []
-    if not converged:
-        parts.append("the maximum was not reached; where weights grow without end, a penalty keeps them")
+def _maximum_told(converged: bool, away: str) -> list[str]:
+    if away == RISES:
+        return ["the likelihood has no maximum that was found: weights grow without end; a penalty keeps them"]
+    if away == LEVELS:
+        return ["the likelihood is level where weights grow: they may be any large numbers; a penalty keeps them"]
+    return [] if converged else ["the maximum was not reached; where weights grow without end, a penalty keeps them"]
+
+
+def _directions_told(hidden: np.ndarray, lost: list[str], away: bool) -> list[str]:
+    parts = []
     if hidden.shape[1]:
-        parts.append(f"{hidden.shape[1]} of {len(hidden)} directions of the weights change no behaviour")
+        where = " out there" if away else ""
+        parts.append(f"{hidden.shape[1]} of {len(hidden)} directions of the weights change no behaviour{where}")
+    if lost:
+        parts.append(f"what tells {_listed(lost)} is lost in rounding: no error")
+    return parts
+
+
+def _listed(names: list[str]) -> str:
+    return f"{', '.join(names[:5])}{'...' if len(names) > 5 else ''}"
+
+
+def _message(given: Setting, expert: Demonstrated, solution: Solution, unmet: list[str], found: list[str]) -> str:
+    """What to know of the fit, in one line; "" where there is nothing."""
+    parts = [given.message, *found] if given.message else found
     if unmet:
-        more = "..." if len(unmet) > 5 else ""
-        parts.append(f"no demonstration meets {', '.join(unmet[:5])}{more}: told by what was avoided alone")
+        parts.append(f"no demonstration meets {_listed(unmet)}: told by what was avoided alone")
     if expert.unseen > MUCH_UNSEEN:
         parts.append(f"{expert.unseen:.2g} of the expert's time would pass in states without a step, on the prior")
     if solution.status.name != "CONVERGED":

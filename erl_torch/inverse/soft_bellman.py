@@ -68,9 +68,12 @@ def soft_bellman(
         InputError: tensors that are not as above or not in double precision, or a problem whose solution is not
             ``CONVERGED``; the message has the status.
     """
-    prior_policy = torch.full_like(reward, 1.0 / reward.shape[-1]) if prior_policy is None else prior_policy
-    for name, tensor in (("reward", reward), ("transition", transition), ("prior_policy", prior_policy)):
-        _check_tensor(name, tensor)
+    _check_tensor("reward", reward)
+    _check_tensor("transition", transition)
+    if prior_policy is None:
+        n_states, n_actions = checks.array("reward", reward, ("n_states", "n_actions"), _ANY).shape
+        prior_policy = torch.full((n_states, n_actions), 1.0 / n_actions, dtype=torch.float64)
+    _check_tensor("prior_policy", prior_policy)
     if isinstance(beta, torch.Tensor):
         _check_tensor("beta", beta)
     solved: tuple[torch.Tensor, torch.Tensor, torch.Tensor] = _Solved.apply(
@@ -80,7 +83,7 @@ def soft_bellman(
 
 
 def _check_tensor(name: str, value: torch.Tensor) -> None:
-    checks.instance(name, value, torch.Tensor, "a tensor")
+    checks.instance(name, value, torch.Tensor, "a tensor, as torch.tensor(..., dtype=torch.float64) makes one")
     if value.dtype != torch.float64 or value.layout != torch.strided or value.device.type != "cpu":
         given = f"a tensor of {value.dtype}, {value.layout}, on {value.device}"
         raise InputError(name, given, "a strided tensor of torch.float64 on cpu")
@@ -163,6 +166,10 @@ def _rows(
     checks.instance("pattern", pattern, sp.csr_array, "a csr_array of scipy's")
     if pattern.shape != shape:
         raise InputError("pattern", f"a matrix of shape {pattern.shape}", f"of shape {list(shape)} ([S*A, S])")
+    try:
+        pattern.check_format(full_check=True)
+    except ValueError as error:
+        raise InputError("pattern", "a sparse matrix", f"one with indices in range ({error})") from error
     data = checks.array("transition", transition, (len(pattern.indices),), _ANY)
     pair = np.repeat(np.arange(shape[0]), np.diff(pattern.indptr))
     sums = np.bincount(pair, data, shape[0])
