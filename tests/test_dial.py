@@ -570,3 +570,12 @@ def test_optimism_is_a_number(optimism):
     mdp = random_mdp(np.random.default_rng(3), 3, 2)
     with pytest.raises(InputError, match="optimism"):
         solve_soft_bellman(mdp, 1.0, optimism=optimism)
+
+
+@pytest.mark.parametrize("best", [{"beta": 3.0, "optimism": 0.0}, {"beta": 2.0, "optimism": -2.0}])
+def test_bounds_of_another_problem_certify_nothing(best):
+    mdp = random_mdp(np.random.default_rng(0), 3, 2)
+    solution = solve_soft_bellman(mdp, 3.0, optimism=-2.0)
+    with pytest.raises(InputError, match=r"best=of beta .* must be of beta 3, optimism -2"):
+        certify(solution, mdp, 3.0, best=solve_soft_bellman(mdp, best["beta"], optimism=best["optimism"]))
+    assert certify(solution, mdp, 3.0, best=solution).gap <= 1e-9

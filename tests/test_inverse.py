@@ -689,3 +689,35 @@ def test_the_page_s_example_prints_what_the_page_says(capsys):
         ).groups()
         exec(code, names)
         assert capsys.readouterr().out == output
+
+
+@pytest.mark.parametrize("optimism", [0.0, 1.0, 2.0])
+def test_gap_is_what_the_demonstrated_policy_loses(optimism):
+    """g* - J(pi_E) by the limits of the test's own backups, for an expert that the feature does not explain."""
+    rng, beta = np.random.default_rng(7), 2.0
+    p, prior = rng.dirichlet(np.ones(3), (3, 2)), np.full((3, 2), 0.5)
+    policy = rng.dirichlet(np.ones(2), 3)
+    fit = fit_reward(
+        policy,
+        rng.normal(size=(3, 2, 1)),
+        mdp=TabularMDP(p, np.zeros((3, 2))),
+        beta=beta,
+        optimism=optimism,
+        exact=True,
+    )
+
+    def mean(value):
+        kappa = optimism * beta
+        return np.log(p @ np.exp(kappa * value)) / kappa if kappa else p @ value
+
+    def rate(backup):
+        value = np.zeros(3)
+        for _ in range(4000):
+            new = backup(fit.reward + mean(value))
+            step, value = new - value, new - new[0]
+        return step.mean()
+
+    best = rate(lambda q: np.log((prior * np.exp(beta * q)).sum(1)) / beta)
+    own = rate(lambda q: (policy * (q - np.log(policy / prior) / beta)).sum(1))
+    assert fit.gap == pytest.approx(best - own, abs=1e-9)
+    assert fit.gap > 1e-3

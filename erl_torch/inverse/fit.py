@@ -33,6 +33,7 @@ from erl_torch.inverse.demonstrations import Demonstrated, Setting, demonstrated
 from erl_torch.inverse.derivatives import Linearised, linearise
 from erl_torch.mdp.tabular import TabularMDP
 from erl_torch.solution import Solution
+from erl_torch.solvers import nested
 from erl_torch.solvers.chains import SingularChainError
 from erl_torch.solvers.problem import BellmanProblem
 from erl_torch.solvers.soft_bellman import solve_problem
@@ -60,15 +61,16 @@ class RewardFit:
     Errors are of first order, and count the chance in the expert's actions alone: the model is taken to be right.
     """
 
-    weights: np.ndarray  # [F], reward; no part in ``unidentified``
+    weights: np.ndarray  # [F], reward; at optimism 0 without a part in ``unidentified``
     reward: np.ndarray  # [S, A], sum_k w_k phi_k; of a table 0 in pairs that take no part
     standard_error: np.ndarray | None  # of the told part of ``weights``, [F]; infinite without, None where exact
     identified: np.ndarray  # [F] bool: whether the weight itself is, not only a combination; its error is finite
-    unidentified: np.ndarray  # [F, k], orthonormal columns: w plus any of them explains the behaviour as well
+    unidentified: np.ndarray  # [F, k], orthonormal columns: w plus any of them explains the behaviour as well;
+    # above optimism 0 to first order in them
     eigenvalues: np.ndarray  # of the information of one step about the other directions, ascending, 1/reward^2
     unmet: tuple[int, ...]  # features that are 0 in all that was demonstrated
     solution: Solution  # of ``reward``, with its certificate
-    gap: float  # what pi_E loses by ``reward``: mean KL(pi_E || pi) / beta over its flow, reward per step
+    gap: float  # what pi_E loses by ``reward`` at the expert's optimism, g* - J(pi_E), reward per step
     log_likelihood: float  # mean of log(pi/prior) over the demonstrations, nats per step
     n_steps: float  # demonstrated; infinite where the policy was exact
     # The flows of features differ by ``tol`` of each feature's size at most, the penalty counted, and the likelihood is
@@ -149,11 +151,12 @@ def fit_reward(
     away = RISES if refused else _away(objective, weights, at)
     if optimism == 0:  # shaping, which changes nothing at all
         weights = told @ (told.T @ weights)
-    solution = objective.solve(objective.problem(weights))
+    problem = objective.problem(weights)
+    solution = objective.solve(problem)
     eigenvalues, error, lost = _information(objective, at, space)
     converged = converged and away != RISES
     rounded = [labels[k] for k in np.flatnonzero(lost & space.own)]
-    told_of = [*_maximum_told(converged, away), *_directions_told(hidden, rounded, bool(away))]
+    told_of = [*_maximum_told(converged, away), *_directions_told(hidden, rounded, bool(away), optimism)]
     seen = (expert.weight if expert.exact else expert.counts).ravel() > 0
     unmet = tuple(np.flatnonzero(~(table[seen] != 0).any(0)).tolist())
     return RewardFit(
@@ -165,7 +168,7 @@ def fit_reward(
         eigenvalues=eigenvalues,
         unmet=unmet,
         solution=solution,
-        gap=float(_divergence(expert.policy, at) @ expert.flow.sum(1)) / beta,
+        gap=_gap(problem, expert, at, solution),
         log_likelihood=float((expert.weight * at.log_ratio).sum()),
         n_steps=np.inf if expert.exact else expert.n_steps,
         converged=converged,
@@ -455,6 +458,16 @@ def _away(objective: _Objective, weights: np.ndarray, at: Linearised) -> str:
     return RISES if change > RISE else LEVELS if change > -LEVEL else ""
 
 
+def _gap(problem: BellmanProblem, expert: Demonstrated, at: Linearised, solution: Solution) -> float:
+    """g* - J(pi_E) >= 0, reward per step: at optimism 0 a mean of divergences, in which no digit is lost."""
+    if not problem.optimism:
+        return float(_divergence(expert.policy, at) @ expert.flow.sum(1)) / problem.beta
+    p = problem
+    worth = nested.objective(p.transition, p.reward, p.prior, p.beta, expert.policy, p.start, optimism=p.optimism).value
+    assert solution.theta is not None
+    return max(-solution.theta - worth, 0.0)
+
+
 def _divergence(policy: np.ndarray, at: Linearised) -> np.ndarray:
     """KL(policy || pi*) of each state, [n]."""
     prior = at.problem.prior
@@ -471,11 +484,11 @@ def _maximum_told(converged: bool, away: str) -> list[str]:
     return [] if converged else ["the maximum was not reached; where weights grow without end, a penalty keeps them"]
 
 
-def _directions_told(hidden: np.ndarray, lost: list[str], away: bool) -> list[str]:
+def _directions_told(hidden: np.ndarray, lost: list[str], away: bool, optimism: float) -> list[str]:
     parts = []
     if hidden.shape[1]:
-        where = " out there" if away else ""
-        parts.append(f"{hidden.shape[1]} of {len(hidden)} directions of the weights change no behaviour{where}")
+        where, order = " out there" if away else "", " to first order" if optimism else ""
+        parts.append(f"{hidden.shape[1]} of {len(hidden)} directions of the weights change no behaviour{order}{where}")
     if lost:
         parts.append(f"what tells {_listed(lost)} is lost in rounding: no error")
     return parts

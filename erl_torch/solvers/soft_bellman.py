@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from erl_torch import checks
+from erl_torch.checks import InputError
 from erl_torch.mdp.tabular import TabularMDP, check_policy, check_prior
 from erl_torch.solution import Solution
 from erl_torch.solvers.horizons import Backup, BellmanState, iterate, undiscounted
@@ -111,14 +112,23 @@ def certify(
 
     The bounds are those of ``best``, the ``solve_soft_bellman`` of the model; None solves the model now. The gap is the
     upper bound on g* less the lower bound on J(policy) from the start (``nested.objective``).
+
+    Raises:
+        InputError: as ``solve_soft_bellman``, or a ``best`` without bounds, or of another beta or optimism.
     """
     checks.instance("solution", solution, Solution, "a Solution")
     if best is not None:
         checks.instance("best", best, Solution, "a Solution")
     optimism = solution.optimism if optimism is None else optimism
     problem = BellmanProblem.of(mdp, beta, prior_policy, optimism)
+    if best is not None and (best.beta, best.optimism) != (problem.beta, problem.optimism):
+        told, asked = (
+            f"beta {x:g}, optimism {y:g}" for x, y in ((best.beta or np.nan, best.optimism), (beta, optimism))
+        )
+        raise InputError("best", f"of {told}", f"of {asked}")
     bounds = (best or solve_soft_bellman(mdp, beta, prior_policy, optimism=optimism)).theta_bounds
-    assert bounds is not None
+    if bounds is None:
+        raise InputError("best", "solution without theta_bounds", "one of solve_soft_bellman, with them")
     policy = check_policy("policy", solution.policy, mdp.n_states, mdp.n_actions, mdp.allowed)[problem.states]
     return replace(
         solution, theta_bounds=bounds, gap=policy_gap(problem, policy, bounds), beta=beta, optimism=problem.optimism
