@@ -28,6 +28,7 @@ from erl_torch.solvers import kernels
 from erl_torch.solvers.certificates import gains, objective, policy_gains
 from erl_torch.solvers.chains import RegenerativeLU, SingularChainError, long_run
 from erl_torch.solvers.policy import objective as worth
+from erl_torch.solvers.problem import BellmanProblem
 
 
 @pytest.fixture(autouse=True)
@@ -599,3 +600,66 @@ def test_rounding_of_a_sum_over_actions_is_in_the_bounds():
         weights, r = [Fraction(float(v)) for v in prior[0]], [Fraction(float(v)) for v in reward[0]]
         mean = (weights[0] * r[0] + weights[1] * r[1]) / sum(weights)
         assert Fraction(float(low[0])) <= mean <= Fraction(float(high[0]))
+
+
+# -- certainty equivalents ------------------------------------------------------------------------------------
+
+HALF_UNIT = 2.0**-53
+
+
+def only_rounding(row, value, kappa):
+    """(low, exact, high) of the gain of a state whose reward cancels it as computed: what is left is rounding."""
+    n = len(value)
+    p = sp.csr_array(np.vstack([row, np.eye(n)[1:]]))
+    p.eliminate_zeros()
+    reward, prior = np.zeros((n, 1)), np.ones((n, 1))
+    reward[0] = -gains(p, reward, prior, 1.0, value, kappa).gain[0]
+    found = gains(p, reward, prior, 1.0, value, kappa)
+    weights, moved = [mpf(float(x)) for x in row], [mpf(float(v)) - mpf(float(value[0])) for v in value]
+    mean = mp.fsum(w * mp.exp(mpf(kappa) * x) for w, x in zip(weights, moved, strict=True)) / mp.fsum(weights)
+    exact = mp.log(mean) / mpf(kappa) + mpf(float(reward[0, 0]))
+    return mpf(float(found.low[0])), exact, mpf(float(found.high[0]))
+
+
+def one_successor(rng):
+    return np.array([0.0, 1 - 9 * HALF_UNIT]), rng.uniform(1, 2, 2) * [-1, 1], float(rng.choice([-0.1, 0.1, 1e-9]))
+
+
+def rare_and_far(rng):
+    t, kappa = rng.uniform(1, 600), rng.uniform(0.5, 2)
+    p = np.exp(-t) * rng.uniform(0.05, 0.45)
+    return np.array([1 - 9 * HALF_UNIT - p, p]), np.array([0, t / kappa]) + rng.uniform(), kappa
+
+
+def rare_and_best(rng):
+    t, kappa = rng.uniform(30, 300), rng.uniform(1, 5) * rng.choice([-1, 1])
+    p = np.exp(-t) * rng.uniform(2, 9)
+    return np.array([1 - 9 * HALF_UNIT - p, p]), np.array([0, t / kappa]) + rng.uniform(), kappa
+
+
+@pytest.mark.parametrize("make", [one_successor, rare_and_far, rare_and_best], ids=lambda make: make.__name__)
+def test_rounding_of_certainty_equivalents(make):
+    """60 digits lie inside; with bounds a quarter as far from their middle some would not, but for the best one."""
+    rng = np.random.default_rng(1)
+    worst = 0.0
+    for _ in range(300):
+        low, exact, high = only_rounding(*make(rng))
+        assert low <= exact <= high
+        worst = max(worst, float(abs(exact - (low + high) / 2) / ((high - low) / 2)))
+    assert worst > {"one_successor": 0.25, "rare_and_far": 0.1, "rare_and_best": 0.0}[make.__name__]
+
+
+def test_what_nature_is_paid_is_rounded_up():
+    """The feared problem's rewards: r + KL(q || p)/|kappa| or more, in 60 digits of the rows as they are stored."""
+    rng = np.random.default_rng(0)
+    for _ in range(40):
+        n, kappa = int(rng.integers(2, 6)), -(10 ** rng.uniform(-2, 2))
+        mdp = TabularMDP(rng.dirichlet(np.ones(n), (n, 2)), np.zeros((n, 2)))
+        problem = BellmanProblem.of(mdp, 1.0, optimism=kappa)
+        feared = problem.feared(rng.normal(size=n))
+        p, q = problem.transition.toarray(), feared.transition.toarray()
+        for row, paid in enumerate((feared.reward - problem.reward).ravel()):
+            shares = [[mpf(float(x)) for x in table[row]] for table in (p, q)]
+            old, new = ([x / mp.fsum(each) for x in each] for each in shares)
+            kl = mp.fsum(b * mp.log(b / a) for a, b in zip(old, new, strict=True) if b)
+            assert mpf(float(paid)) * mpf(float(-problem.kappa)) >= kl
