@@ -481,3 +481,11 @@ def test_the_page_s_example_prints_what_the_page_says(capsys):
     code, output = re.search(r"<!-- example: shift -->\n```python\n(.*?)```\n\n```text\n(.*?)```", page, re.S).groups()
     exec(code, {})
     assert capsys.readouterr().out == output
+
+
+def test_weights_that_overflow_are_refused():
+    data = Transitions([0, 1], [0, 0], [0.0, 0.0], [1, 0], [0, 0], [1e250, 1.0])
+    with pytest.raises(InputError, match=r"weight=inf: must be finite"):
+        reweighted(data, lambda s, a, s_next: np.full(len(s), 1e100))
+    with pytest.raises(InputError, match=r"ratio\(0, 0, 1\)=1e\+200: must be finite and >= 0: 0, or 1e-100 to 1e\+100"):
+        reweighted(data, lambda s, a, s_next: np.full(len(s), 1e200))

@@ -37,6 +37,7 @@ from erl_torch.solvers.chains import reachable_from
 REWARDS = ("pair", "successor")  # what a reward depends on
 NAMED = 5  # pairs in a message
 
+LARGEST_RATIO = 1e100
 Ratio = Callable[[np.ndarray, np.ndarray, np.ndarray], ArrayLike]
 
 
@@ -53,7 +54,7 @@ def reweighted(experience: Experience, ratio: Ratio) -> Experience:
 
     Args:
         experience: the tuples. Weights that they have are multiplied.
-        ratio: of arrays s, a, s' [n], p^(s'|s,a) / p(s'|s,a) [n]: finite and >= 0.
+        ratio: of arrays s, a, s' [n], p^(s'|s,a) / p(s'|s,a) [n]: 0, or from 1e-100 to 1e100.
 
     Notes:
         Pairs whose mean ratio is below .5 are told (``erl_torch.notes``): most of the successors that p^ leads to were
@@ -116,14 +117,17 @@ def _with_ratio(chunk: Transitions, ratio: Ratio) -> Transitions:
     weight = checks.real("ratio", ratio(chunk.s, chunk.a, chunk.s_next))
     if weight.shape != chunk.s.shape:
         raise InputError("ratio", f"an array of shape {weight.shape}", f"of one weight a tuple, {chunk.s.shape}")
-    fits, allowed = checks.NOT_NEGATIVE
-    if not (good := fits(weight)).all():
+    weight = np.ascontiguousarray(weight, np.float64)
+    # Sums of squares stay in double precision.
+    if not (good := (weight == 0) | ((weight >= 1 / LARGEST_RATIO) & (weight <= LARGEST_RATIO))).all():
         t = int(np.argmin(good))
         place = f"ratio({chunk.s[t]}, {chunk.a[t]}, {chunk.s_next[t]})"
-        raise InputError(place, float(weight[t]), allowed)
-    weight = np.ascontiguousarray(weight, np.float64)
+        raise InputError(place, float(weight[t]), f"finite and >= 0: 0, or {1 / LARGEST_RATIO:g} to {LARGEST_RATIO:g}")
     if chunk.weight is not None:
-        weight = weight * chunk.weight
+        with np.errstate(over="ignore"):  # an infinite weight is refused, by its row
+            weight = weight * chunk.weight
+        if not np.isfinite(weight).all():
+            raise InputError("weight", np.inf, "finite: the weights that the tuples have are too large for this ratio")
     return Transitions.checked(chunk.s, chunk.a, chunk.r, chunk.s_next, chunk.a_next, weight)
 
 
