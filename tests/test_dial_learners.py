@@ -397,3 +397,12 @@ def test_a_comparison_is_of_one_optimism():
     np.testing.assert_allclose(found.measures["gap"][0], found.measures["gap"][1], atol=1e-6)
     with pytest.raises(InputError, match=r"s1: optimism=0\.0: must be that of ce, 1: one objective for all"):
         compare(mdp, learners | {"s1": EfficientS1(3.0)}, 5, 1000, seeds=1)
+
+
+@pytest.mark.parametrize("optimism", [1e-14, -1e-12, 1e-10])
+def test_intervals_are_continuous_at_0(optimism):
+    mdp = windy(np.random.default_rng(6))
+    model = empirical_mdp(collect(mdp, 1, 5000, 0), mdp.n_states, mdp.n_actions)
+    there, near = (theta_uncertainty(model, 3.0, optimism=x) for x in (0.0, optimism))
+    assert near.value == pytest.approx(there.value, abs=1e-8)
+    np.testing.assert_allclose(near.interval(), there.interval(), atol=1e-6)

@@ -386,8 +386,8 @@ def _worth(problem: BellmanProblem, policy: np.ndarray, value: np.ndarray | None
 
     def backed_up(value: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(T V - V of the policy [n], C V [n*A], q)."""
-        log_mean, _, tilted = problem.tilt(problem.kappa * value)
-        certain = log_mean / problem.kappa
+        certain, tilted = problem.certainty_equivalent(value), problem.tilted(value)
+        assert tilted is not None
         return reward + (policy * certain.reshape(policy.shape)).sum(1) - value, certain, tilted
 
     value = np.zeros(problem.n_states) if value is None else value - value[ref]

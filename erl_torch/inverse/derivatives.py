@@ -18,10 +18,10 @@ from typing import NamedTuple
 import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
-from scipy.special import xlog1py
 
 from erl_torch.solvers.certificates import soft_backup
 from erl_torch.solvers.chains import RegenerativeLU, SingularChainError
+from erl_torch.solvers.dial import price
 from erl_torch.solvers.problem import BellmanProblem
 
 NEAR = 1e-9  # of a Newton step, times beta: below, the next one would change nothing
@@ -125,21 +125,8 @@ class Linearised:
         cost = (self.policy * self.log_ratio).sum(1) / beta**2
         by_beta = weight @ cost + float((by_log_policy * self.log_ratio).sum()) / beta
         if problem.optimism:
-            by_beta += problem.optimism * float(pair.ravel() @ self._certain_by_kappa())
+            by_beta += problem.optimism * float((pair * price(problem, self.value, self.tilted.data)).sum())
         return Cotangents(pair, pair / beta, float(by_beta))
-
-    def _certain_by_kappa(self) -> np.ndarray:
-        """d C V / d kappa = KL(q* || p) / kappa^2, [n*A], as a sum of terms that are not negative."""
-        p, kappa = self.problem.transition, self.problem.kappa
-        rows = np.repeat(np.arange(p.shape[0]), np.diff(p.indptr))
-        with np.errstate(over="ignore"):
-            x = np.expm1(kappa * (self.value[p.indices] - self.certain[rows]))
-            small = np.abs(x) < 1e-3
-            near = np.where(small, x, 0.0)
-            series = near**2 * (1 / 2 - near / 6 + near**2 / 12 - near**3 / 20)
-            far = np.where(small, 0.0, x)
-            terms = np.where(small, series, xlog1py(1 + far, far) - far)
-        return np.bincount(rows, p.data * terms, p.shape[0]) / kappa**2
 
 
 def linearise(problem: BellmanProblem, value: np.ndarray, steps: int = LAST_STEPS) -> Linearised:

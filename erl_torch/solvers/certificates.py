@@ -111,6 +111,13 @@ def soft_backup(q: np.ndarray, prior: np.ndarray, beta: float) -> tuple[np.ndarr
     return backed_up, policy
 
 
+def normalised(policy: np.ndarray) -> np.ndarray:
+    """``policy`` [S, A], its rows divided by their sums where these are not 1 but for rounding."""
+    policy = np.asarray(policy, np.float64)
+    sums = policy.sum(1, keepdims=True)
+    return np.where(np.abs(sums - 1) > 2e-15, policy / sums, policy)
+
+
 class Objective(NamedTuple):
     """J(pi), the long-run reward rate less KL/beta from the start, reward per step."""
 
@@ -135,9 +142,7 @@ def objective(
     leaves for ever does not count.
     """
     n_states, n_actions = reward.shape
-    policy = np.asarray(policy, np.float64)
-    sums = policy.sum(1, keepdims=True)
-    policy = np.where(np.abs(sums - 1) > 2e-15, policy / sums, policy)
+    policy = normalised(policy)
     chain = policy_chain(transition, policy)
     # Which state can follow which, even where products of probabilities underflow.
     possible = sp.csr_array((np.ones(transition.nnz), transition.indices, transition.indptr), shape=transition.shape)

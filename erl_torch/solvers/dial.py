@@ -114,11 +114,14 @@ def _solved(solution: Solution, mdp: TabularMDP, prior_policy: ArrayLike | None)
     policy = soft_backup(problem.action_value(value), problem.prior, problem.beta)[1]
     dynamics = problem.tilt(problem.kappa * value)[2] if problem.kappa else problem.transition.data
     share = long_run(problem.chain(policy, dynamics), problem.start).of_state
-    return _Solved(problem, policy, dynamics, _price(problem, value, dynamics), share)
+    return _Solved(problem, policy, dynamics, price(problem, value, dynamics), share)
 
 
-def _price(problem: BellmanProblem, value: np.ndarray, dynamics: np.ndarray) -> np.ndarray:
-    """KL(q_V || p)/kappa^2, [n, A], as a sum of terms that are not negative: no digit is lost as kappa tends to 0."""
+def price(problem: BellmanProblem, value: np.ndarray, dynamics: np.ndarray) -> np.ndarray:
+    """d C V / d kappa = KL(q_V || p)/kappa^2, [n, A], for ``dynamics`` q_V (CSR data).
+
+    A sum of terms that are not negative: no digit is lost as kappa tends to 0.
+    """
     p, kappa = problem.transition, problem.kappa
     rows = np.repeat(np.arange(p.shape[0]), np.diff(p.indptr))
     above = value[p.indices] - problem.certainty_equivalent(value)[rows]

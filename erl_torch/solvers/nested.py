@@ -17,7 +17,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from erl_torch.solvers import certificates
-from erl_torch.solvers.certificates import SHARP_WIDTH, Objective
+from erl_torch.solvers.certificates import SHARP_WIDTH, Objective, normalised
 from erl_torch.solvers.chains import policy_chain, reachable_from
 from erl_torch.solvers.horizons import Backup, BellmanState, iterate
 from erl_torch.solvers.problem import BellmanProblem
@@ -51,10 +51,7 @@ def objective(
     """
     if optimism == 0.0:
         return certificates.objective(transition, reward, prior, beta, policy, start)
-    policy = np.asarray(policy, np.float64)
-    sums = policy.sum(1, keepdims=True)
-    policy = np.where(np.abs(sums - 1) > 2e-15, policy / sums, policy)
-    problem, policy = _met(transition, reward, prior, beta, policy, start, optimism)
+    problem, policy = _met(transition, reward, prior, beta, normalised(policy), start, optimism)
     if ((policy > 0) & ~(problem.prior > 0)).any():
         return Objective(-np.inf, -np.inf, -np.inf)
     low, high, narrow = -np.inf, np.inf, 0
