@@ -151,8 +151,7 @@ def fit_reward(
     away = RISES if refused else _away(objective, weights, at)
     if optimism == 0:  # shaping, which changes nothing at all
         weights = told @ (told.T @ weights)
-    problem = objective.problem(weights)
-    solution = objective.solve(problem)
+    solution = objective.solve(objective.problem(weights))
     eigenvalues, error, lost = _information(objective, at, space)
     converged = converged and away != RISES
     rounded = [labels[k] for k in np.flatnonzero(lost & space.own)]
@@ -168,7 +167,7 @@ def fit_reward(
         eigenvalues=eigenvalues,
         unmet=unmet,
         solution=solution,
-        gap=_gap(problem, expert, at, solution),
+        gap=_gap(expert, at),
         log_likelihood=float((expert.weight * at.log_ratio).sum()),
         n_steps=np.inf if expert.exact else expert.n_steps,
         converged=converged,
@@ -458,14 +457,18 @@ def _away(objective: _Objective, weights: np.ndarray, at: Linearised) -> str:
     return RISES if change > RISE else LEVELS if change > -LEVEL else ""
 
 
-def _gap(problem: BellmanProblem, expert: Demonstrated, at: Linearised, solution: Solution) -> float:
-    """g* - J(pi_E) >= 0, reward per step: at optimism 0 a mean of divergences, in which no digit is lost."""
-    if not problem.optimism:
-        return float(_divergence(expert.policy, at) @ expert.flow.sum(1)) / problem.beta
-    p = problem
-    worth = nested.objective(p.transition, p.reward, p.prior, p.beta, expert.policy, p.start, optimism=p.optimism).value
-    assert solution.theta is not None
-    return max(-solution.theta - worth, 0.0)
+def _gap(expert: Demonstrated, at: Linearised) -> float:
+    """g* - J(pi_E) >= 0, reward per step; no digit is lost, as it is a rate of divergences.
+
+    T_pi V* - V* = g* - KL(pi || pi*)/beta, so J - g* is the worth of pi where it pays these in the dynamics q*.
+    """
+    loss = _divergence(expert.policy, at) / at.problem.beta
+    if not at.problem.optimism:
+        return float(loss @ expert.flow.sum(1))
+    p, policy = at.problem, expert.policy
+    reward = np.repeat(-loss[:, None], policy.shape[1], axis=1)
+    worth = nested.objective(at.tilted, reward, policy, p.beta, policy, p.start, optimism=p.optimism)
+    return max(-worth.value, 0.0)
 
 
 def _divergence(policy: np.ndarray, at: Linearised) -> np.ndarray:
