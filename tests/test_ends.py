@@ -1,12 +1,23 @@
 """Charges and bonuses at the ends of episodes: rules, models, steps, the smallest charge, runs."""
 
+import re
+
 import gymnasium as gym
 import numpy as np
 import pytest
 from helpers import composed, random_mdp
 from scipy.optimize import linprog
 
-from erl_torch import InputError, TabularMDP, evaluate_episodes, smallest_charge, solve_soft_bellman, tabular_mdp
+from erl_torch import (
+    CertaintyEquivalence,
+    InputError,
+    TabularMDP,
+    Transitions,
+    evaluate_episodes,
+    smallest_charge,
+    solve_soft_bellman,
+    tabular_mdp,
+)
 from erl_torch.envs.ends import EndReward
 from erl_torch.mdp.ends import Failures, chance_of_pairs, failing_ends, with_end_reward
 from erl_torch.mdp.from_gymnasium import model_ends
@@ -384,6 +395,42 @@ def test_a_run_finds_the_charge(tmp_path):
     assert any("end_reward=auto: -1.07591608" in text for text in result["notes"])
 
 
+def test_a_run_from_steps_finds_the_charge_of_its_tuples(tmp_path):
+    """The multiplier of the run's own counts: they fail as often as asked for at it, and more often with less."""
+    few = ("env.use_model=false", "experience.n_episodes=3000", "evaluation.n_episodes=5", "evaluation.pictures=false")
+    asked = (
+        "env.end_reward=auto",
+        "env.end_target=0.01",
+        "learner.beta=20",
+        "experience.save_to=" + str(tmp_path / "t.npz"),
+    )
+    result = train(composed("env=frozen_lake", "learner=certainty_equivalence", *few, *asked), tmp_path / "run")
+    charge = -float(re.search(r"end_reward=auto: (\S+), by the counts", " ".join(result["notes"]))[1])
+    stream = np.load(tmp_path / "t.npz")
+    failed = stream["r"] < -charge / 2
+    assert set(np.round(stream["r"][failed], 9)) == {round(-charge, 9)}
+
+    def failing_rate(charge):
+        reward = np.where(failed, -charge, stream["r"])
+        data = Transitions(*(stream[name] for name in ("s", "a")), reward, stream["s_next"], stream["a_next"])
+        policy = CertaintyEquivalence(20.0).fit(data, 16, 4).policy.numpy()
+        p, f = np.zeros((16, 16)), np.zeros(16)
+        visits = np.zeros((16, 4))
+        np.add.at(visits, (data.s, data.a), 1)
+        share = policy[data.s, data.a] / visits[data.s, data.a]
+        np.add.at(p, (data.s, data.s_next), share)
+        np.add.at(f, data.s, share * failed)
+        met = visits.any(1)
+        p = p[met][:, met]
+        long_run = np.linalg.lstsq(np.vstack([p.T - np.eye(len(p)), np.ones(len(p))]), [0] * len(p) + [1], rcond=None)[
+            0
+        ]
+        return long_run @ f[met]
+
+    assert failing_rate(charge) == pytest.approx(0.01, rel=1e-4)
+    assert failing_rate(0.99 * charge) > 0.01 * 1.001
+
+
 def test_a_run_from_steps_learns_of_the_charge(tmp_path):
     """The stream's rewards, and theta of the data with them; the return is the environment's own."""
     few = (
@@ -415,7 +462,7 @@ def test_a_run_from_steps_learns_of_the_charge(tmp_path):
             "env.end_target=2: must be a number in",
         ),
         (
-            ["env=cart_pole_v1", "env.end_reward=auto"],
+            ["env=cart_pole_v1", "env.end_reward=auto", "+vary.beta=[1,2]"],
             "env.end_reward=auto: must be a number, where there is no model",
         ),
     ],

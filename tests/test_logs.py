@@ -838,7 +838,7 @@ def test_a_log_resumes_sweeps_and_varies(tmp_path, shop, typed_here):
                               "learner.lr_u=0.01,0.02", "hydra.sweep.dir=sweep")  # fmt: skip
     assert code == 0, err
     assert len(list((tmp_path / "sweep").glob("*/policy.csv"))) == 2
-    code, _, err = typed_here("train.py", *typed, *SHORT, "vary.beta=[1,2]", "hydra.run.dir=many")
+    code, _, err = typed_here("train.py", *typed, *SHORT, "+vary.beta=[1,2]", "hydra.run.dir=many")
     assert code == 0, err
     many = json.loads((tmp_path / "many" / "result.json").read_text())
     assert many["groups"][0]["theta"]["mean"] == whole["theta"]
@@ -1047,10 +1047,46 @@ def test_the_end_of_a_bad_row_tells_nothing(tmp_path):
         read_log(path, on_bad="skip", end_reward=-3)
 
 
-def test_auto_needs_a_model(tmp_path):
+def test_the_charge_of_auto_is_that_of_the_counts(tmp_path):
+    """Two states, one choice: with m = share of the risky action, its failing rate is m f, and the charge at which that
+    is the target is known: m/(1 - m) = exp(beta (r - f c))."""
+    rng = np.random.default_rng(5)
+    rows = ["s,a,r,terminated,truncated"]
+    failed = visits = 0
+    for _ in range(4000):
+        risky = rng.random() < 0.5
+        fails = risky and rng.random() < 0.2
+        rows.append(f"here,{'risky' if risky else 'safe'},{0 if fails else 1.0 * risky},{int(fails)},0")
+        failed, visits = failed + fails, visits + risky
+    rows += ["here,safe,2,1,0"] * 2  # an end that pays more: the others are failures
+    (tmp_path / "log.csv").write_text("\n".join(rows))
+    n_safe = 4002 - visits
+    beta, target = 2.0, 0.01
+    f, paid = failed / visits, 1 - failed / visits
+    gap = paid - 2 * 2 / n_safe  # rewards are means over what was seen
+    share = target / f
+    charge = (gap - np.log(share / (1 - share)) / beta) / f
+    keys = ("env.end_reward=auto", f"env.end_target={target}", f"learner.beta={beta}", "learner=certainty_equivalence")
+    cfg = composed("experience=recorded", f"experience.path={tmp_path}/log.csv", *keys)
+    result = train(cfg, tmp_path / "run")
+    found = float(re.search(r"end_reward=auto: (\S+), by the counts", " ".join(result["notes"]))[1])
+    assert found == pytest.approx(-charge, rel=1e-6)
+    text = (tmp_path / "run" / "policy.csv").read_text()
+    assert float(re.search(r"here,risky,(\S+?),", text)[1]) == pytest.approx(share, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("keys", "said"),
+    [
+        (("+vary.beta=[1,2]",), "one beta: the charge depends on it"),
+        (("env.end_target=0",), "env.end_target=0"),
+        (("env.failures=none",), "env.end_reward"),
+    ],
+)
+def test_auto_that_cannot_be(tmp_path, keys, said):
     (tmp_path / "log.csv").write_text(ENDS)
-    cfg = composed("experience=recorded", f"experience.path={tmp_path}/log.csv", "env.end_reward=auto")
-    with pytest.raises(InputError, match=r"env.end_reward=auto: must be a number for a log"):
+    cfg = composed("experience=recorded", f"experience.path={tmp_path}/log.csv", "env.end_reward=auto", *keys)
+    with pytest.raises(InputError, match=said):
         train(cfg, tmp_path / "run")
 
 

@@ -17,6 +17,7 @@ from tqdm import tqdm
 
 from erl_torch import checks
 from erl_torch.checks import InputError
+from erl_torch.empirical.charge import charge_of_tuples
 from erl_torch.envs import ENTRY_POINTS
 from erl_torch.envs.discretise import Discretise
 from erl_torch.envs.encoded import encoded, labels_of
@@ -57,7 +58,7 @@ REPLICA_BYTES = 10_000  # of a replica, besides: generators and settings
 LABELS = ("class", "name")  # keys of every group that are no arguments
 OF_THE_MODEL = ("stream", "n_samples", "model_seed")  # of a control task
 NO_ENV = "none"  # in the place of Gymnasium's id
-OF_A_LOG = (*LABELS, "id", "suggest", "unseen_actions", "end_reward", "failures")
+OF_A_LOG = (*LABELS, "id", "suggest", "unseen_actions", "end_reward", "failures", "end_target")
 OF_NO_ENV = (*KEYS_OF_ENV, *OF_THE_MODEL, *OF_EVERY_ENV)
 
 
@@ -75,6 +76,10 @@ class World(NamedTuple):
         """The actions that each state has, [S, A] bool, as the model tells them; None where there is none."""
         mdp = self.source if isinstance(self.source, TabularMDP) else self.mdp
         return None if mdp is None else mdp.allowed
+
+
+# The tuples that a world gives, and the prior [S, A] on the actions that it told meanwhile.
+Counted = Callable[[World], tuple[Experience, np.ndarray]]
 
 
 @contextlib.contextmanager
@@ -165,10 +170,11 @@ def make_world(
     safe_point: SafePoint,
     beta: float | None = None,
     prior: np.ndarray | None = None,
+    counted: Counted | None = None,
 ) -> World:
-    """What there is to learn from in ``env``, as ``cfg`` says. ``beta`` and ``prior`` are for ``end_reward=auto``.
+    """What there is to learn from in ``env``, as ``cfg`` says.
 
-    Raises InputError.
+    ``beta``, ``prior`` and, where there is no model, ``counted`` are for ``end_reward=auto``. Raises InputError.
     """
     if all(key in cfg for key in OF_THE_MODEL):
         return _control_world(cfg, env, safe_point)
@@ -183,7 +189,7 @@ def make_world(
             if masking:
                 reason = "there is no model (P) to read, and masks of mdp or info are used in any case"
                 raise InputError("use_action_mask", True, f"false: {reason}")
-            return _world_of_steps(cfg, env, failures, beta, prior)
+            return _world_of_steps(cfg, env, failures, beta, prior, counted)
         allowed = masks_of(env) if masking else None
         end_reward = _end_reward(cfg, env, beta, prior, allowed)
     told = cfg.get("failures", "default")
@@ -232,23 +238,44 @@ def _end_reward(
     if value != "auto":
         return checks.finite("end_reward", value)
     if beta is None:
-        raise InputError("end_reward", value, "a number here, or beta given: the charge depends on it")
+        raise InputError("end_reward", value, "a number here, or one beta: the charge depends on it")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MeanRewardWarning)
         ends = model_ends(env, cfg.get("failures", "default"))
         if not ends.failed.any():
             raise InputError("end_reward", value, "a number: no end is a failure by this rule (env.failures)")
-        try:
+        with _end_target():
             model = tabular_mdp(env, allowed=allowed)
             found = smallest_charge(model, ends.failed, beta, cfg.get("end_target", 1e-3), prior)
-        except InputError as error:
-            raise InputError("end_target", error.value, error.allowed) if error.key == "target" else error from error
     note(f"end_reward=auto: {-found.charge:.9g}, at which {found.failing_rate:.3g} of the optimum's steps fail")
     return -found.charge
 
 
+@contextlib.contextmanager
+def _end_target() -> Iterator[None]:
+    """Complaints raised inside call the target by its key."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError("end_target", error.value, error.allowed) if error.key == "target" else error from error
+
+
+def _counted_charge(free: Experience, charged: Experience, beta: float, target: float, prior: np.ndarray) -> float:
+    """The end reward of ``end_reward=auto`` where tuples are all that there is (``charge_of_tuples``)."""
+    with _end_target():
+        found = charge_of_tuples(free, charged, beta, target, prior)
+    rate = f"{found.failing_rate:.3g} of the steps of their optimum fail"
+    note(f"end_reward=auto: {-found.charge:.9g}, by the counts of the tuples alone, at which {rate}")
+    return -found.charge
+
+
 def _world_of_steps(
-    cfg: DictConfig, env: gym.Env[Any, Any], failures: Failures | None, beta: float | None, prior: np.ndarray | None
+    cfg: DictConfig,
+    env: gym.Env[Any, Any],
+    failures: Failures | None,
+    beta: float | None,
+    prior: np.ndarray | None,
+    counted: Counted | None,
 ) -> World:
     """That of an environment without a table ``P``, or whose table is not to be used."""
     mdp = known_mdp(env)
@@ -264,8 +291,12 @@ def _world_of_steps(
         return World(charged, charged, ends=rule)
     end_reward = cfg.get("end_reward", 0.0)
     if end_reward == "auto":
-        allowed = "a number, where there is no model (of a log: erl_torch.smallest_charge, on its counts)"
-        raise InputError("end_reward", end_reward, allowed)
+        if beta is None or counted is None:
+            allowed = "a number, where there is no model (but for train.py with experience=simulate and one beta)"
+            raise InputError("end_reward", end_reward, allowed)
+        source = EndReward(env, -1.0, cfg.get("failures", "default"))
+        (free, _), (charged, told) = map(counted, (World(env, None), World(source, None, ends=source.rule)))
+        end_reward = _counted_charge(free, charged, beta, cfg.get("end_target", 1e-3), told)
     end_reward = checks.finite("end_reward", end_reward)
     if not end_reward:
         return World(env, None, ends=None if failures is None else EndRule(failures))
@@ -330,19 +361,28 @@ def make_log(cfg: DictConfig, safe_point: SafePoint) -> tuple[Log, TabularLearne
         raise InputError("experience", cfg.experience.name, allowed)
     for key in map(str, cfg.env):
         if key not in OF_A_LOG:
-            raise InputError(f"env.{key}", cfg.env[key], f"left out: no such key; there are {', '.join(OF_A_LOG[-3:])}")
+            raise InputError(f"env.{key}", cfg.env[key], f"left out: no such key; there are {', '.join(OF_A_LOG[-4:])}")
     checks.one_of("env.unseen_actions", cfg.env.unseen_actions, UNSEEN)
     end_reward, failures = cfg.env.get("end_reward", 0.0), cfg.env.get("failures", "default")
-    if end_reward == "auto":
-        allowed = "a number for a log (from Python: erl_torch.smallest_charge, on its counts)"
-        raise InputError("env.end_reward", end_reward, allowed)
+    auto = end_reward == "auto"
+    if auto and "beta" in cfg.vary:
+        raise InputError("env.end_reward", end_reward, "a number here, or one beta: the charge depends on it")
     with group("env"):
-        checks.finite("end_reward", end_reward)
+        checks.finite("end_reward", 0.0 if auto else end_reward)
         checks.one_of("failures", failures, RULES)
-    try:
+
+    def read(end_reward: float) -> Log:
         with group("experience"), _collecting(source.work, None, safe_point) as report:
-            prior = learner.prior_policy
-            log = source.log(cfg.seed, cfg.env.unseen_actions, prior, report, end_reward, failures)
+            return source.log(cfg.seed, cfg.env.unseen_actions, learner.prior_policy, report, end_reward, failures)
+
+    try:
+        if auto:
+            free, charged = read(0.0), read(-1.0)
+            with group("env"):
+                target = cfg.env.get("end_target", 1e-3)
+                data = free.experience, charged.experience
+                end_reward = _counted_charge(*data, learner.beta, target, free.problem.prior)
+        log = read(end_reward)
     except InputError as error:
         name = error.key.removeprefix("experience.")
         if name == "end_reward":

@@ -27,7 +27,7 @@ from erl_torch.compiled import announcement
 from erl_torch.experience.experience import Experience, permitted
 from erl_torch.experience.log import Log
 from erl_torch.experience.simulation import digest, longest
-from erl_torch.experience.sources import Source
+from erl_torch.experience.sources import Simulate, Source
 from erl_torch.learners.learner import TabularLearner, as_told, with_prior
 from erl_torch.learners.replicas import Replicas
 from erl_torch.learners.s1 import kernels
@@ -38,7 +38,9 @@ from erl_torch.notes import collected, note
 from erl_torch.problem import Problem
 from erl_torch.rng import streams
 from erl_torch.run.build import (
+    Counted,
     FromLog,
+    World,
     check_sizes,
     group,
     is_log,
@@ -140,12 +142,22 @@ def _of_environment(
     """Who learns, and what, where there is an environment."""
     beta: float | None = None
     prior: np.ndarray | None = None
+    counted: Counted | None = None
     if cfg.env.get("end_reward") == "auto" and "beta" not in cfg.vary:  # the charge depends on both
         learner = make_learner(cfg.learner, *sizes(env))
         beta = learner.beta
         if learner.prior_policy is not None:
             prior = check_policy("learner.prior_policy", learner.prior_policy, *sizes(env))
-    world = make_world(cfg.env, env, safe_point, beta, prior)
+        source = make_source(cfg.experience)
+        if isinstance(source, Simulate):
+            stream = replace(source, save_to=None)
+
+            def counted(world: World) -> tuple[Experience, np.ndarray]:
+                problem = make_problem(cfg, env, world, learner)
+                data, _ = make_experience(stream, problem, cfg.seed, safe_point)
+                return data, as_told(learner, problem)[1].prior
+
+    world = make_world(cfg.env, env, safe_point, beta, prior, counted)
     learner = make_learner(cfg.learner, *sizes(env))
     if world.allowed is not None:
         learner = with_prior(learner, world.allowed)
