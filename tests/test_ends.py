@@ -412,7 +412,7 @@ def test_a_run_from_steps_finds_the_charge_of_its_tuples(tmp_path):
 
     def failing_rate(charge):
         reward = np.where(failed, -charge, stream["r"])
-        data = Transitions(*(stream[name] for name in ("s", "a")), reward, stream["s_next"], stream["a_next"])
+        data = Transitions(stream["s"], stream["a"], reward, stream["s_next"], stream["a_next"])
         policy = CertaintyEquivalence(20.0).fit(data, 16, 4).policy.numpy()
         p, f = np.zeros((16, 16)), np.zeros(16)
         visits = np.zeros((16, 4))

@@ -295,8 +295,9 @@ def _world_of_steps(
             allowed = "a number, where there is no model (but for train.py with experience=simulate and one beta)"
             raise InputError("end_reward", end_reward, allowed)
         source = EndReward(env, -1.0, cfg.get("failures", "default"))
-        (free, _), (charged, told) = map(counted, (World(env, None), World(source, None, ends=source.rule)))
-        end_reward = _counted_charge(free, charged, beta, cfg.get("end_target", 1e-3), told)
+        data, _ = counted(World(env, None))
+        lower, told = counted(World(source, None, ends=source.rule))
+        end_reward = _counted_charge(data, lower, beta, cfg.get("end_target", 1e-3), told)
     end_reward = checks.finite("end_reward", end_reward)
     if not end_reward:
         return World(env, None, ends=None if failures is None else EndRule(failures))
