@@ -1,0 +1,377 @@
+"""Average-reward learners with networks, for Discrete actions: ``DeepS1`` and ``AverageSoftQ``.
+
+Both have the fixed point of the tables' problem, Q = r + E V(s'), V = (1/beta) log sum_a pi0 exp(beta Q) - g, by the
+squared loss, whose minimum is a mean: nothing is clipped, and no loss is Huber's, whose minimum is none (theory page, 11).
+``DeepS1`` fits r + V(s') with a lagged V, and V by a network of its own, as S1 has <log psi> beside psi;
+``AverageSoftQ`` (average-reward soft Q-learning, ASQL) has V from the lagged Q. Where the truth is known they are a draw.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+
+from erl_torch import checks
+from erl_torch.checks import InputError
+from erl_torch.learners.learner import NonFiniteError
+from erl_torch.networks import autograd, kernels
+from erl_torch.networks.layout import Layout, mlp
+from erl_torch.networks.live import Exploration, Live, Walk
+from erl_torch.networks.problem import BoxProblem
+from erl_torch.networks.replay import Replay, Steps
+from erl_torch.solution import Status
+
+LIMIT = 3.0  # the slope of the exponential loss is capped at exp(LIMIT)
+COMPILED_WIDTH = 256  # widest hidden layer that the compiled path takes by itself
+PATHS = ("auto", "compiled", "autograd")
+ENDS = ("restart", "episodic")
+
+
+@dataclass(frozen=True, eq=False)
+class NetworkState:
+    """What one learner of one seed knows: a value.
+
+    Args:
+        weights, lagged, m, v: float32 vectors (``erl_torch.networks.kernels``).
+        numbers: [N_NUMBERS] float64, as there.
+        random: state of the generator of minibatches.
+        replay: the tuples so far.
+        walk: where the environment is; None of recorded tuples.
+        figures: what is logged, by name.
+    """
+
+    weights: torch.Tensor
+    lagged: torch.Tensor
+    m: torch.Tensor
+    v: torch.Tensor
+    numbers: np.ndarray
+    random: np.ndarray
+    replay: Replay
+    walk: Walk | None
+    figures: dict[str, float]
+
+    @property
+    def n_updates(self) -> int:
+        return int(self.numbers[kernels.UPDATES])
+
+    @property
+    def theta(self) -> float:
+        """Minus the regularised reward a step, as estimated over the minibatches of the last epoch."""
+        return self.figures["theta"]
+
+    def metrics(self) -> Mapping[str, float]:
+        return self.figures
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class NetworkLearner:
+    """What both learners share; frozen settings, checked when it is made.
+
+    Args:
+        beta: inverse temperature, 1/reward, > 0.
+        optimism: 0 right; 1 the optimistic agent of control as inference; negative robust. Not 0: for demonstrations,
+            as the slope of its loss is capped.
+        n_steps: of the environment, or updates on recorded tuples, >= 1.
+        epoch_steps: of them between states, >= 1.
+        hidden: widths of the hidden layers.
+        lr, lr_end_fraction: Adam's rate, which falls on a line to that fraction of it.
+        tau: share of the way that the lagged copy goes in an update, in (0, 1].
+        g_rate: the same of the reward rate g, in (0, 1].
+        batch: tuples of an update, >= 1.
+        updates_per_step: >= 1; the first one comes when a batch is stored.
+        replay_size: tuples kept; None is all.
+        explore_start, explore_end, explore_fraction, explore_hold: ``Exploration``.
+        on_termination: "restart": an end leads to where the next episode begins, the average-reward problem; "episodic":
+            an end is worth 0 and there is no rate, the undiscounted problem of one episode.
+        reward_scale: factor of rewards, > 0; theta is of the rewards as they are.
+        support_penalty: weight of staying near the recorded actions (conservative Q-learning's form), reward, >= 0.
+        path: "compiled" (two hidden layers, CPU), "autograd" (any), or "auto".
+        device: of torch, where updates are made; compiled ones on the CPU.
+
+    Raises:
+        InputError: an argument out of its range.
+    """
+
+    beta: float = 10.0
+    optimism: float = 0.0
+    n_steps: int = 60_000
+    epoch_steps: int = 1000
+    hidden: tuple[int, ...] = (64, 64)
+    lr: float = 1e-3
+    lr_end_fraction: float = 0.02
+    tau: float = 0.01
+    g_rate: float = 0.01
+    batch: int = 64
+    updates_per_step: int = 1
+    replay_size: int | None = None
+    explore_start: float = 1.0
+    explore_end: float = 0.1
+    explore_fraction: float = 0.5
+    explore_hold: float = 1.0
+    on_termination: str = "restart"
+    reward_scale: float = 1.0
+    support_penalty: float = 0.0
+    path: str = "auto"
+    device: str = "cpu"
+
+    unit: ClassVar[str] = "steps"
+    needs_model: ClassVar[bool] = False
+    separate: ClassVar[bool]  # whether V has a network of its own
+
+    def __post_init__(self) -> None:
+        checks.temperature("beta", self.beta)
+        checks.optimism("optimism", self.optimism, self.beta)
+        for key in ("n_steps", "epoch_steps", "batch", "updates_per_step"):
+            checks.at_least(key, getattr(self, key), 1)
+        hidden = checks.sequence("hidden", self.hidden)
+        for width in hidden:
+            checks.at_least("hidden", width, 1)
+        if not hidden:
+            raise InputError("hidden", "[]", "at least one width, as [64,64]")
+        object.__setattr__(self, "hidden", tuple(map(int, hidden)))
+        for key in ("lr", "reward_scale"):
+            checks.positive(key, getattr(self, key))
+        for key in ("tau", "g_rate"):
+            checks.step_size(key, getattr(self, key))
+        if self.replay_size is not None:
+            checks.at_least("replay_size", self.replay_size, self.batch)
+        share = "a number in [0, 1]"
+        for key in ("explore_start", "explore_end", "lr_end_fraction"):
+            checks.number(key, getattr(self, key), lambda x: 0 <= x <= 1, share)
+        checks.number("explore_fraction", self.explore_fraction, lambda x: 0 < x <= 1, "a number in (0, 1]")
+        checks.number("explore_hold", self.explore_hold, lambda x: 1 <= x < math.inf, "a number >= 1")
+        checks.number("support_penalty", self.support_penalty, lambda x: 0 <= x < math.inf, "a number >= 0")
+        checks.one_of("on_termination", self.on_termination, ENDS)
+        checks.one_of("path", self.path, PATHS)
+        checks.device("device", self.device)
+        if self.path == "compiled" and (len(hidden) != 2 or self.device != "cpu"):
+            raise InputError("path", self.path, "autograd or auto, for other than two hidden layers, or off the CPU")
+
+    @property
+    def states(self) -> tuple[type, ...]:
+        return (NetworkState, Walk, Replay)
+
+    # -- networks -------------------------------------------------------------------------------------
+
+    @property
+    def compiled(self) -> bool:
+        """Whether updates are made by compiled loops."""
+        small = len(self.hidden) == 2 and max(self.hidden) <= COMPILED_WIDTH and self.device == "cpu"
+        return self.path == "compiled" or (self.path == "auto" and small)
+
+    def layouts(self, problem: BoxProblem) -> tuple[Layout, Layout | None]:
+        """Of Q and of V; None without a network of V."""
+        q = mlp(problem.n_observation, self.hidden, problem.n_actions)
+        return q, mlp(problem.n_observation, self.hidden, 1) if self.separate else None
+
+    def check(self, problem: BoxProblem) -> None:
+        """Raise InputError for a problem that it cannot learn."""
+        if not problem.n_actions:
+            allowed = "one for continuous actions, or an environment with Discrete actions (env.actions=5 makes five)"
+            raise InputError("learner", type(self).__name__, allowed)
+
+    def init(self, problem: BoxProblem, seed: int, replay: Replay | None = None, walk: Walk | None = None) -> NetworkState:
+        """The state of ``seed`` before the first update."""
+        self.check(problem)
+        q, v = self.layouts(problem)
+        rng, draws = (np.random.default_rng(one) for one in np.random.SeedSequence([seed, 1]).spawn(2))
+        own = q.start(rng, zero_output=self.separate)
+        value = np.zeros(0, np.float32) if v is None else v.start(rng, zero_output=True)
+        weights = torch.from_numpy(np.concatenate([own, value]))
+        lagged = weights[q.size :].clone() if self.separate else weights[: q.size].clone()
+        random = np.array([int(draws.integers(2**63))], np.uint64).view(np.int64)
+        if replay is None:
+            replay = Replay.empty(problem.n_observation, 0, self.replay_size or self.n_steps)
+        zero = torch.zeros_like(weights)
+        figures = dict.fromkeys(self._names(walk is not None), math.nan)
+        return NetworkState(
+            weights, lagged, zero, zero.clone(), np.zeros(kernels.N_NUMBERS), random, replay, walk, figures
+        )
+
+    def _names(self, live: bool) -> tuple[str, ...]:
+        band = ("residual_lower", "residual_upper") if self.separate else ()
+        own = ("exploration", "episode_return") if live else ()
+        return ("theta", "g", "loss", "kl", *band, *own)
+
+    # -- epochs ---------------------------------------------------------------------------------------
+
+    def epoch(self, problem: BoxProblem, state: NetworkState, live: Live | None) -> NetworkState:
+        """The state after ``epoch_steps`` more steps, or what is left; ``state`` is left as it is.
+
+        Raises:
+            NonFiniteError: weights that left the finite numbers.
+            InputError: as ``Live.collect``.
+        """
+        n = min(self.epoch_steps, self.n_steps - self.position(state))
+        weights, lagged, m, v = (x.clone() for x in (state.weights, state.lagged, state.m, state.v))
+        numbers, random = state.numbers.copy(), state.random.copy()
+        numbers[kernels.THETA_SUM :] = 0.0
+        log_prior = np.full(problem.n_actions, -math.log(problem.n_actions))
+        walk, replay = state.walk, state.replay
+        if live is None:
+            self._updates(problem, replay, weights, lagged, m, v, numbers, random, log_prior, n)(replay.n, n)
+        else:
+            assert walk is not None
+            replay = replay.with_room(n)
+            learn = self._updates(
+                problem, replay, weights, lagged, m, v, numbers, random, log_prior, self.n_steps * self.updates_per_step
+            )
+            schedule = Exploration(self.explore_start, self.explore_end, self.explore_fraction, self.explore_hold)
+            walk, replay = live.collect(
+                walk, replay, n, self.n_steps, schedule, self._chooser(problem, weights, log_prior),
+                lambda stored: learn(stored, self.updates_per_step) if stored >= self.batch else None,
+                self.reward_scale,
+            )  # fmt: skip
+        if not (torch.isfinite(weights).all() and math.isfinite(numbers[kernels.G])):
+            raise NonFiniteError(self.position(state), f"weights left the finite numbers within {n} steps")
+        new = NetworkState(weights, lagged, m, v, numbers, random, replay, walk, {})
+        return replace(new, figures=self._figures(problem, new, n))
+
+    def _updates(
+        self, problem: BoxProblem, replay: Replay, weights: torch.Tensor, lagged: torch.Tensor, m: torch.Tensor,
+        v: torch.Tensor, numbers: np.ndarray, random: np.ndarray, log_prior: np.ndarray, n_total: int,
+    ) -> Any:  # fmt: skip
+        """(tuples stored, updates) -> None, in place."""
+        kappa = self.optimism * self.beta
+        episodic = self.on_termination == "episodic"
+        lr_end = self.lr * self.lr_end_fraction
+        if self.compiled:
+            arrays = [x.numpy() for x in (weights, lagged, m, v)]
+            fixed = [getattr(replay, name) for name in ("observation", "action", "reward", "following", "ended")]
+            draws = random.view(np.uint64)
+            tail = (
+                *self.hidden, self.batch, self.separate, float(self.beta), float(kappa), log_prior, float(self.lr),
+                lr_end, n_total, float(self.tau), float(self.g_rate), float(self.support_penalty), episodic, LIMIT,
+            )  # fmt: skip
+
+            def compiled(stored: int, n: int) -> None:
+                kernels.advance(*arrays, numbers, draws, *fixed, stored, n, *tail)
+
+            return compiled
+        q, value = self.layouts(problem)
+        columns = [
+            torch.from_numpy(getattr(replay, name)) for name in ("observation", "action", "reward", "following", "ended")
+        ]
+        prior = torch.from_numpy(log_prior)
+        draws = random.view(np.uint64)
+
+        def plain(stored: int, n: int) -> None:
+            autograd.advance(
+                q, value, weights, lagged, m, v, numbers, draws, *columns, stored, n, self.batch, self.beta, kappa,
+                prior, self.lr, lr_end, n_total, self.tau, self.g_rate, self.support_penalty, episodic, LIMIT,
+            )  # fmt: skip
+
+        return plain
+
+    def _chooser(self, problem: BoxProblem, weights: torch.Tensor, log_prior: np.ndarray) -> Any:
+        """(observation [1, d], uniform number) -> action, of the weights as they are when it is called."""
+        q, _ = self.layouts(problem)
+        if self.compiled:
+            vector = weights.numpy()[: q.size]
+            h1, h2 = self.hidden
+            beta = float(self.beta)
+            return lambda observation, uniform: kernels.act(vector, h1, h2, log_prior, beta, observation, uniform)
+
+        def choose(observation: np.ndarray, uniform: float) -> int:
+            p = policy_of(q.output(weights[: q.size], torch.from_numpy(observation)), self.beta)[0]
+            return min(int(np.searchsorted(np.cumsum(p), uniform, side="right")), len(p) - 1)
+
+        return choose
+
+    def _figures(self, problem: BoxProblem, state: NetworkState, n: int) -> dict[str, float]:
+        """What is logged of ``state``, whose last epoch had ``n`` steps."""
+        numbers, scale = state.numbers, self.reward_scale
+        count = numbers[kernels.SUMMED]
+        mean = (lambda place: float(numbers[place] / count)) if count else (lambda place: math.nan)
+        replay = state.replay
+        recent = np.arange(replay.at - min(n, replay.n), replay.at) % len(replay.reward)
+        rows = torch.from_numpy(replay.observation[recent])
+        q_layout, v_layout = self.layouts(problem)
+        q = q_layout.output(state.weights[: q_layout.size], rows)
+        p = policy_of(q, self.beta)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            kl = np.where(p > 0, p * np.log(p * problem.n_actions), 0.0).sum(1).mean()
+        found = {
+            "theta": mean(kernels.THETA_SUM) / scale,
+            "g": float(numbers[kernels.G]) / scale,
+            "loss": mean(kernels.LOSS_SUM) / scale**2,
+            "kl": float(kl),
+        }
+        if v_layout is not None:
+            soft = torch.logsumexp(self.beta * q.double(), 1) - math.log(problem.n_actions)
+            residual = soft / self.beta - v_layout.output(state.weights[q_layout.size :], rows)[:, 0].double()
+            low, high = np.quantile(residual.numpy() / scale, [0.05, 0.95])
+            found |= {"residual_lower": float(low), "residual_upper": float(high)}
+        if state.walk is not None:
+            schedule = Exploration(self.explore_start, self.explore_end, self.explore_fraction, self.explore_hold)
+            returns = state.walk.returns
+            found["exploration"] = schedule.share(state.walk.n_steps, self.n_steps)
+            found["episode_return"] = float(np.mean(returns)) if returns else math.nan
+        return found
+
+    # -- the contract ---------------------------------------------------------------------------------
+
+    def start(self, problem: BoxProblem) -> NetworkState:
+        """The state of seed 0 of ``problem``, without an environment."""
+        return self.init(problem, 0)
+
+    def begin(self, problem: BoxProblem, experience: Live | Steps, seed: int = 0) -> NetworkState:
+        """The state before anything is learnt from ``experience``; ``seed`` is that of recorded tuples."""
+        if isinstance(experience, Live):
+            return self.init(problem, experience.seed, None, experience.start())
+        scaled = replace(experience, reward=experience.reward * np.float32(self.reward_scale))
+        return self.init(problem, seed, Replay.of(scaled))
+
+    def run(
+        self, problem: BoxProblem, experience: Live | Steps, state: NetworkState | None = None
+    ) -> Iterator[NetworkState]:
+        """Yield the state after each epoch, from ``state`` on, until ``n_steps``."""
+        state = self.begin(problem, experience) if state is None else state
+        live = experience if isinstance(experience, Live) else None
+        while self.position(state) < self.n_steps:
+            state = self.epoch(problem, state, live)
+            yield state
+
+    def position(self, state: NetworkState) -> int:
+        """Steps so far; of recorded tuples updates."""
+        return state.n_updates if state.walk is None else state.walk.n_steps
+
+    def work(self, state: NetworkState) -> int:
+        return self.position(state)
+
+    def total(self, experience: object = None) -> int:
+        return self.n_steps
+
+    def milestone(self, state: NetworkState) -> str:
+        """``last step`` at the end."""
+        return "last step" if self.position(state) >= self.n_steps else ""
+
+    def progress(self, state: NetworkState) -> str:
+        """Theta, and the returns of episodes."""
+        text = f"theta {state.theta:.4f}"
+        earned = state.figures.get("episode_return", math.nan)
+        return text if math.isnan(earned) else f"{text} return {earned:.4g}"
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DeepS1(NetworkLearner):
+    """S1 with networks (S1-V): one for Q, which fits r + V(s') of a lagged V, and one for V."""
+
+    separate: ClassVar[bool] = True
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class AverageSoftQ(NetworkLearner):
+    """Average-reward soft Q-learning (ASQL): one network, which fits r - g + V(s') of its lagged copy."""
+
+    separate: ClassVar[bool] = False
+
+
+def policy_of(q: torch.Tensor, beta: float) -> np.ndarray:
+    """pi(a|s) ~ exp(beta Q), the prior uniform, [N, A] float64 of q [N, A]."""
+    return torch.softmax(beta * q.double(), 1).numpy()
