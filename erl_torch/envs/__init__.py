@@ -46,6 +46,7 @@ ENTRY_POINTS = {
     "erl_torch/MachineReplacement-v0": "machine_replacement:MachineReplacementEnv",
     "erl_torch/RiverSwim-v0": "river_swim:RiverSwimEnv",
     "erl_torch/TwoChoice-v0": "two_choice:TwoChoiceEnv",
+    "erl_torch/WindyStrip-v0": "windy_strip:WindyStripEnv",
     **CONTROL_ENTRY_POINTS,
 }
 
