@@ -18,7 +18,7 @@ FLOORS = (
     {"envs", "solvers"},
     {"experience"},
     {"empirical", "evaluation"},
-    {"learners", "inverse"},
+    {"learners", "inverse", "networks"},
     {"run"},
     {"reproduction"},
     {"cli"},
@@ -31,6 +31,7 @@ BESIDE = {
     ("log", "checks"),
     ("solution", "mdp"),
     ("problem", "mdp"),
+    ("networks", "learners"),
 }
 # The loop that samples as it learns; one call for each of them would cost a tenth of it.
 ACROSS = {("learners.s1.kernels", "experience.kernels")}

@@ -62,7 +62,9 @@ class WindyStripEnv(gym.Env[np.ndarray, int]):
         self.observation_space = gym.spaces.Box(np.zeros(2, np.float32), np.array([WIDTH, LENGTH], np.float32))
         self._at = np.zeros(2)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
         super().reset(seed=seed)
         self._at = self.np_random.uniform(START_LOW, START_HIGH)
         return self._at.astype(np.float32), {}

@@ -54,12 +54,13 @@ __all__ = [
 
 @functools.cache
 def by_name() -> dict[str, Any]:
-    """The classes of the learners that ``conf/learner`` has, by the name of their configuration."""
+    """The classes of the learners of tables that ``conf/learner`` has, by the name of their configuration."""
     classes = {}
     for name in configurations.names("learner"):
         path = configurations.folder() / "learner" / f"{name}.yaml"
         module, _, attribute = yaml.safe_load(path.read_text())["class"].rpartition(".")
-        classes[name] = getattr(importlib.import_module(module), attribute)
+        if not module.startswith("erl_torch.networks."):
+            classes[name] = getattr(importlib.import_module(module), attribute)
     return classes
 
 

@@ -9,8 +9,8 @@ squared loss, whose minimum is a mean: nothing is clipped, and no loss is Huber'
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -22,6 +22,7 @@ from erl_torch.learners.learner import NonFiniteError
 from erl_torch.networks import autograd, kernels
 from erl_torch.networks.layout import Layout, mlp
 from erl_torch.networks.live import Exploration, Live, Walk
+from erl_torch.networks.policy import NetworkPolicy
 from erl_torch.networks.problem import BoxProblem
 from erl_torch.networks.replay import Replay, Steps
 from erl_torch.solution import Status
@@ -68,6 +69,25 @@ class NetworkState:
         return self.figures
 
 
+@dataclass(frozen=True, eq=False)
+class NetworkSolution:
+    """What learners of networks have come to.
+
+    Args:
+        status: COMPLETED, STOPPED or NON_FINITE.
+        message: what ended it before.
+        theta: [K], minus the regularised reward a step, as the networks of each seed estimate it.
+        states: of each seed.
+        n_steps: of the environment, of each; of recorded tuples updates.
+    """
+
+    status: Status
+    message: str
+    theta: np.ndarray
+    states: tuple[NetworkState, ...]
+    n_steps: int
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class NetworkLearner:
     """What both learners share; frozen settings, checked when it is made.
@@ -88,7 +108,8 @@ class NetworkLearner:
         explore_start, explore_end, explore_fraction, explore_hold: ``Exploration``.
         on_termination: "restart": an end leads to where the next episode begins, the average-reward problem; "episodic":
             an end is worth 0 and there is no rate, the undiscounted problem of one episode.
-        reward_scale: factor of rewards, > 0; theta is of the rewards as they are.
+        train_time_limit: steps of an episode while it learns; None is the environment's own limit, 0 is none.
+        reward_scale: factor of rewards in the networks, > 0; beta, theta and penalties are of the rewards as they are.
         support_penalty: weight of staying near the recorded actions (conservative Q-learning's form), reward, >= 0.
         path: "compiled" (two hidden layers, CPU), "autograd" (any), or "auto".
         device: of torch, where updates are made; compiled ones on the CPU.
@@ -100,7 +121,7 @@ class NetworkLearner:
     beta: float = 10.0
     optimism: float = 0.0
     n_steps: int = 60_000
-    epoch_steps: int = 1000
+    epoch_steps: int = 5000
     hidden: tuple[int, ...] = (64, 64)
     lr: float = 1e-3
     lr_end_fraction: float = 0.02
@@ -114,6 +135,7 @@ class NetworkLearner:
     explore_fraction: float = 0.5
     explore_hold: float = 1.0
     on_termination: str = "restart"
+    train_time_limit: int | None = None
     reward_scale: float = 1.0
     support_penalty: float = 0.0
     path: str = "auto"
@@ -140,6 +162,8 @@ class NetworkLearner:
             checks.step_size(key, getattr(self, key))
         if self.replay_size is not None:
             checks.at_least("replay_size", self.replay_size, self.batch)
+        if self.train_time_limit is not None:
+            checks.at_least("train_time_limit", self.train_time_limit, 0)
         share = "a number in [0, 1]"
         for key in ("explore_start", "explore_end", "lr_end_fraction"):
             checks.number(key, getattr(self, key), lambda x: 0 <= x <= 1, share)
@@ -159,6 +183,16 @@ class NetworkLearner:
     # -- networks -------------------------------------------------------------------------------------
 
     @property
+    def scaled_beta(self) -> float:
+        """In the units of the networks."""
+        return self.beta / self.reward_scale
+
+    def policy(self, problem: BoxProblem, state: NetworkState) -> NetworkPolicy:
+        """What ``state`` has learnt."""
+        q, _ = self.layouts(problem)
+        return NetworkPolicy(q, state.weights[: q.size], self.scaled_beta)
+
+    @property
     def compiled(self) -> bool:
         """Whether updates are made by compiled loops."""
         small = len(self.hidden) == 2 and max(self.hidden) <= COMPILED_WIDTH and self.device == "cpu"
@@ -175,7 +209,9 @@ class NetworkLearner:
             allowed = "one for continuous actions, or an environment with Discrete actions (env.actions=5 makes five)"
             raise InputError("learner", type(self).__name__, allowed)
 
-    def init(self, problem: BoxProblem, seed: int, replay: Replay | None = None, walk: Walk | None = None) -> NetworkState:
+    def init(
+        self, problem: BoxProblem, seed: int, replay: Replay | None = None, walk: Walk | None = None
+    ) -> NetworkState:
         """The state of ``seed`` before the first update."""
         self.check(problem)
         q, v = self.layouts(problem)
@@ -185,15 +221,16 @@ class NetworkLearner:
         weights = torch.from_numpy(np.concatenate([own, value]))
         lagged = weights[q.size :].clone() if self.separate else weights[: q.size].clone()
         random = np.array([int(draws.integers(2**63))], np.uint64).view(np.int64)
+        figures = dict.fromkeys(self.names(replay is None), math.nan)
         if replay is None:
             replay = Replay.empty(problem.n_observation, 0, self.replay_size or self.n_steps)
         zero = torch.zeros_like(weights)
-        figures = dict.fromkeys(self._names(walk is not None), math.nan)
         return NetworkState(
             weights, lagged, zero, zero.clone(), np.zeros(kernels.N_NUMBERS), random, replay, walk, figures
         )
 
-    def _names(self, live: bool) -> tuple[str, ...]:
+    def names(self, live: bool) -> tuple[str, ...]:
+        """Of its ``metrics()``; ``live``: of an environment that it steps."""
         band = ("residual_lower", "residual_upper") if self.separate else ()
         own = ("exploration", "episode_return") if live else ()
         return ("theta", "g", "loss", "kl", *band, *own)
@@ -225,7 +262,7 @@ class NetworkLearner:
             walk, replay = live.collect(
                 walk, replay, n, self.n_steps, schedule, self._chooser(problem, weights, log_prior),
                 lambda stored: learn(stored, self.updates_per_step) if stored >= self.batch else None,
-                self.reward_scale,
+                self.reward_scale, problem.time_limit if self.train_time_limit is None else self.train_time_limit,
             )  # fmt: skip
         if not (torch.isfinite(weights).all() and math.isfinite(numbers[kernels.G])):
             raise NonFiniteError(self.position(state), f"weights left the finite numbers within {n} steps")
@@ -237,7 +274,9 @@ class NetworkLearner:
         v: torch.Tensor, numbers: np.ndarray, random: np.ndarray, log_prior: np.ndarray, n_total: int,
     ) -> Any:  # fmt: skip
         """(tuples stored, updates) -> None, in place."""
-        kappa = self.optimism * self.beta
+        beta = float(self.scaled_beta)
+        kappa = float(self.optimism * beta)
+        penalty = float(self.support_penalty * self.reward_scale)
         episodic = self.on_termination == "episodic"
         lr_end = self.lr * self.lr_end_fraction
         if self.compiled:
@@ -245,8 +284,8 @@ class NetworkLearner:
             fixed = [getattr(replay, name) for name in ("observation", "action", "reward", "following", "ended")]
             draws = random.view(np.uint64)
             tail = (
-                *self.hidden, self.batch, self.separate, float(self.beta), float(kappa), log_prior, float(self.lr),
-                lr_end, n_total, float(self.tau), float(self.g_rate), float(self.support_penalty), episodic, LIMIT,
+                *self.hidden, self.batch, self.separate, beta, kappa, log_prior, float(self.lr), lr_end, n_total,
+                float(self.tau), float(self.g_rate), penalty, episodic, LIMIT,
             )  # fmt: skip
 
             def compiled(stored: int, n: int) -> None:
@@ -255,15 +294,16 @@ class NetworkLearner:
             return compiled
         q, value = self.layouts(problem)
         columns = [
-            torch.from_numpy(getattr(replay, name)) for name in ("observation", "action", "reward", "following", "ended")
+            torch.from_numpy(getattr(replay, name))
+            for name in ("observation", "action", "reward", "following", "ended")
         ]
         prior = torch.from_numpy(log_prior)
         draws = random.view(np.uint64)
 
         def plain(stored: int, n: int) -> None:
             autograd.advance(
-                q, value, weights, lagged, m, v, numbers, draws, *columns, stored, n, self.batch, self.beta, kappa,
-                prior, self.lr, lr_end, n_total, self.tau, self.g_rate, self.support_penalty, episodic, LIMIT,
+                q, value, weights, lagged, m, v, numbers, draws, *columns, stored, n, self.batch, beta, kappa,
+                prior, self.lr, lr_end, n_total, self.tau, self.g_rate, penalty, episodic, LIMIT,
             )  # fmt: skip
 
         return plain
@@ -274,11 +314,11 @@ class NetworkLearner:
         if self.compiled:
             vector = weights.numpy()[: q.size]
             h1, h2 = self.hidden
-            beta = float(self.beta)
+            beta = float(self.scaled_beta)
             return lambda observation, uniform: kernels.act(vector, h1, h2, log_prior, beta, observation, uniform)
 
         def choose(observation: np.ndarray, uniform: float) -> int:
-            p = policy_of(q.output(weights[: q.size], torch.from_numpy(observation)), self.beta)[0]
+            p = NetworkPolicy(q, weights[: q.size], self.scaled_beta)(observation)[0]
             return min(int(np.searchsorted(np.cumsum(p), uniform, side="right")), len(p) - 1)
 
         return choose
@@ -291,9 +331,9 @@ class NetworkLearner:
         replay = state.replay
         recent = np.arange(replay.at - min(n, replay.n), replay.at) % len(replay.reward)
         rows = torch.from_numpy(replay.observation[recent])
-        q_layout, v_layout = self.layouts(problem)
-        q = q_layout.output(state.weights[: q_layout.size], rows)
-        p = policy_of(q, self.beta)
+        policy = self.policy(problem, state)
+        q = policy.layout.output(policy.weights, rows)
+        p = policy(replay.observation[recent])
         with np.errstate(divide="ignore", invalid="ignore"):
             kl = np.where(p > 0, p * np.log(p * problem.n_actions), 0.0).sum(1).mean()
         found = {
@@ -302,9 +342,11 @@ class NetworkLearner:
             "loss": mean(kernels.LOSS_SUM) / scale**2,
             "kl": float(kl),
         }
+        _, v_layout = self.layouts(problem)
         if v_layout is not None:
-            soft = torch.logsumexp(self.beta * q.double(), 1) - math.log(problem.n_actions)
-            residual = soft / self.beta - v_layout.output(state.weights[q_layout.size :], rows)[:, 0].double()
+            soft = torch.logsumexp(policy.beta * q.double(), 1) - math.log(problem.n_actions)
+            value = v_layout.output(state.weights[policy.layout.size :], rows)[:, 0]
+            residual = soft / policy.beta - value.double()
             low, high = np.quantile(residual.numpy() / scale, [0.05, 0.95])
             found |= {"residual_lower": float(low), "residual_upper": float(high)}
         if state.walk is not None:
@@ -336,6 +378,12 @@ class NetworkLearner:
         while self.position(state) < self.n_steps:
             state = self.epoch(problem, state, live)
             yield state
+
+    def solution(
+        self, state: NetworkState, history: Sequence[Mapping[str, Any]] = (), failure: BaseException | None = None
+    ) -> NetworkSolution:
+        """What ``state`` stands for."""
+        return solution_of(self, (state,), failure)
 
     def position(self, state: NetworkState) -> int:
         """Steps so far; of recorded tuples updates."""
@@ -372,6 +420,12 @@ class AverageSoftQ(NetworkLearner):
     separate: ClassVar[bool] = False
 
 
-def policy_of(q: torch.Tensor, beta: float) -> np.ndarray:
-    """pi(a|s) ~ exp(beta Q), the prior uniform, [N, A] float64 of q [N, A]."""
-    return torch.softmax(beta * q.double(), 1).numpy()
+def solution_of(
+    learner: NetworkLearner, states: tuple[NetworkState, ...], failure: BaseException | None
+) -> NetworkSolution:
+    """What one learner for each of several seeds has come to; ``failure`` is what ended the run."""
+    n = learner.position(states[0])
+    lost = isinstance(failure, NonFiniteError)
+    status = Status.NON_FINITE if lost else Status.COMPLETED if n >= learner.n_steps else Status.STOPPED
+    said = "" if failure is None else str(failure) if lost else f"{type(failure).__name__}: {failure}"
+    return NetworkSolution(status, said, np.array([one.theta for one in states]), states, n)

@@ -120,7 +120,9 @@ class Live:
         for action in walk.actions:
             observation = self._flat(self._step(action)[0])
         if not np.array_equal(observation, walk.observation):
-            allowed = "one whose steps are a function of the seed of its reset and the actions, to go on from a checkpoint"
+            allowed = (
+                "one whose steps are a function of the seed of its reset and the actions, to go on from a checkpoint"
+            )
             raise InputError("env", self.problem.name, allowed)
         self._at = walk
 
@@ -135,7 +137,7 @@ class Live:
 
     def collect(
         self, walk: Walk, replay: Replay, n: int, n_total: int, exploration: Exploration, choose: Any, learn: Any,
-        scale: float = 1.0,
+        scale: float = 1.0, time_limit: int | None = None,
     ) -> tuple[Walk, Replay]:  # fmt: skip
         """``n`` steps from ``walk``, stored in ``replay``, and learnt from one by one.
 
@@ -148,6 +150,7 @@ class Live:
             choose: (observation [1, d], uniform number) -> action of the policy.
             learn: called after each step with the number of tuples.
             scale: of rewards where they are stored.
+            time_limit: steps of an episode at most; None is none.
 
         Raises:
             InputError: an observation or reward that is no number, or an environment that is not where it was.
@@ -162,7 +165,7 @@ class Live:
         taken = list(walk.actions)
         held, action, episode, total = walk.held, walk.action, walk.episode, walk.episode_return
         returns = []
-        limit = problem.train_time_limit or 0
+        limit = time_limit or 0
         low, high = np.array(problem.low, np.float32), np.array(problem.high, np.float32)
         for step in range(walk.n_steps, walk.n_steps + n):
             if held:

@@ -32,8 +32,7 @@ class BoxProblem:
         n_actions: of a Discrete space; 0 where actions are continuous.
         first_action: of the Discrete space: what the environment calls action 0.
         low, high: [k] of continuous actions; empty of discrete ones.
-        time_limit: steps of an episode at most, while policies are measured; None is none.
-        train_time_limit: the same, while it is learnt.
+        time_limit: steps of an episode at most; None is none.
         end_reward: added to the reward of a step that terminates an episode: a charge < 0, or a bonus > 0.
         name: what messages and pictures call it.
         truth: judges policies exactly; None where nothing does.
@@ -46,7 +45,6 @@ class BoxProblem:
     low: tuple[float, ...] = ()
     high: tuple[float, ...] = ()
     time_limit: int | None = None
-    train_time_limit: int | None = None
     end_reward: float = 0.0
     name: str = "the environment"
     truth: Truth | None = None

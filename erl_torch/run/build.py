@@ -97,10 +97,24 @@ def group(name: str) -> Iterator[None]:
 
 
 def make_env(cfg: DictConfig, render_mode: str | None = None) -> gym.Env[Any, Any]:
-    """The environment of ``cfg``: its ``class``, or what Gymnasium has under its ``id``, with both spaces Discrete.
+    """The environment of ``cfg``, with both spaces Discrete. Raises InputError."""
+    shown: dict[str, Any] = {} if render_mode is None else {"render_mode": render_mode}
+    env, arguments = _env_of(cfg, shown)
+    keys: Any = OmegaConf.to_container(cfg, resolve=True)
+    with group("env"):
+        binning = {key: keys.get(key) for key in ("bins", "low", "high", "actions") if key not in arguments}
+        if any(value is not None for value in binning.values()):
+            return Discretise(env, **binning)
+        return encoded(env)
 
-    Raises InputError.
-    """
+
+def raw_env(cfg: DictConfig, **more: object) -> gym.Env[Any, Any]:
+    """The environment of ``cfg`` with the spaces that it has; ``more`` is for ``gymnasium.make``. Raises InputError."""
+    return _env_of(cfg, more)[0]
+
+
+def _env_of(cfg: DictConfig, more: dict[str, Any]) -> tuple[gym.Env[Any, Any], dict[str, Any]]:
+    """The environment of ``cfg``, its ``class`` or what Gymnasium has under its ``id``, and its arguments."""
     keys: Any = OmegaConf.to_container(cfg, resolve=True)
     with group("env"):
         kind, spec = _env_class(keys)
@@ -118,13 +132,12 @@ def make_env(cfg: DictConfig, render_mode: str | None = None) -> gym.Env[Any, An
             arguments = settings_of(keys, kind, OF_NO_ENV)
         if isinstance(arguments.get("wind"), str):
             arguments["wind"] = read_npy(arguments["wind"], "wind")
-        shown: dict[str, Any] = {} if render_mode is None else {"render_mode": render_mode}
         try:
             if isinstance(spec, EnvSpec):  # its arguments may have the names of gymnasium.make's own
                 spec.kwargs = arguments
-                env = gym.make(spec, **shown)
+                env = gym.make(spec, **more)
             else:
-                env = gym.make(spec, **arguments, **shown)
+                env = gym.make(spec, **arguments, **more)
         except InputError:
             raise
         except (gym.error.Error, ImportError) as error:
@@ -139,10 +152,7 @@ def make_env(cfg: DictConfig, render_mode: str | None = None) -> gym.Env[Any, An
                 raise InputError("kwargs", arguments, allowed) from error
             *others, (last, value) = arguments.items()  # as they were typed
             raise InputError("".join(f"{k}={v} env." for k, v in others) + last, value, allowed) from error
-        binning = {key: keys.get(key) for key in ("bins", "low", "high", "actions") if key not in arguments}
-        if any(value is not None for value in binning.values()):
-            return Discretise(env, **binning)
-        return encoded(env)
+        return env, arguments
 
 
 def _env_class(keys: dict[str, Any]) -> tuple[type | None, str | EnvSpec]:
@@ -353,7 +363,7 @@ def is_log(cfg: DictConfig) -> bool:
 
 def make_log(cfg: DictConfig, safe_point: SafePoint) -> tuple[Log, TabularLearner[Any]]:
     """What the log of the run ``cfg`` says, and the learner, with the prior that it says. Raises InputError."""
-    learner: TabularLearner[Any] = _made(cfg.learner, learner_class(cfg.learner), "learner")
+    learner: TabularLearner[Any] = made(cfg.learner, learner_class(cfg.learner), "learner")
     if learner.needs_model:
         raise InputError("learner", cfg.learner.name, "one that learns from experience: a log has no model to solve")
     source = make_source(cfg.experience)
@@ -446,7 +456,7 @@ def learner_class(cfg: DictConfig, key: str = "learner") -> type:
 
 def make_learner(cfg: DictConfig, n_states: int, n_actions: int, key: str = "learner") -> TabularLearner[Any]:
     """The learner of ``cfg``; complaints name their keys under ``key``."""
-    learner: TabularLearner[Any] = _made(cfg, learner_class(cfg, key), key)
+    learner: TabularLearner[Any] = made(cfg, learner_class(cfg, key), key)
     check_sizes(n_states, n_actions)
     with group(key):
         learner.init(n_states, n_actions)  # validates the prior against the sizes
@@ -458,11 +468,11 @@ def make_source(cfg: DictConfig, key: str = "experience") -> Source:
     kind = resolve(cfg.get("class"), f"{key}.class")
     if not issubclass(kind, Source):
         raise InputError(f"{key}.class", cfg["class"], "a class derived from erl_torch.Source")
-    source: Source = _made(cfg, kind, key)
+    source: Source = made(cfg, kind, key)
     return source
 
 
-def _made(cfg: DictConfig, kind: type, key: str) -> Any:  # of ``kind``, whatever that is
+def made(cfg: DictConfig, kind: type, key: str) -> Any:  # of ``kind``, whatever that is
     """The dataclass ``kind`` with the settings of ``cfg``; the prior policy is a file there."""
     with group(key):
         values: Any = OmegaConf.to_container(cfg, resolve=True)

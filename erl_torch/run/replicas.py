@@ -326,7 +326,7 @@ class ReplicaRecorder:
         name = f"{self.title.env}, {self.title.learner}"
         seeds = self._seeds_text()
         if len(self.groups) == 1:
-            lines = ["", *_one_group(name, seeds, self.recorded.names, result)]
+            lines = ["", *one_group(name, seeds, self.recorded.names, result)]
         else:
             lines = ["", *_many_groups(name, seeds, self.groups, result)]
         if (away := result["data_half_widths"]) is not None:
@@ -555,7 +555,8 @@ def reservations_of(
 # -- tables of the summary ----------------------------------------------------------------------------
 
 
-def _one_group(first: str, seeds: str, names: Sequence[str], result: Mapping[str, Any]) -> Iterator[str]:
+def one_group(first: str, seeds: str, names: Sequence[str], result: Mapping[str, Any]) -> Iterator[str]:
+    """Lines of the one group of ``result``, of ``seeds``; ``first`` says whose."""
     (group,) = result["groups"]
     of = at(group["beta"], group["optimism"])
     yield f"{first}, {of}, {plural(result['n_replicas'], 'replica')} ({seeds}): {ended_as(result)}"

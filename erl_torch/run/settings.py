@@ -17,6 +17,24 @@ from erl_torch.guesses import did_you_mean
 
 
 @dataclass
+class Network:
+    """What suits learners with networks."""
+
+    beta: float = 10.0
+    n_steps: int = 50_000
+    end_reward: float = 0.0
+    reward_scale: float = 1.0
+    hidden: list[int] = field(default_factory=lambda: [64, 64])
+    lr: float = 1e-3
+    tau: float = 0.01
+    explore_start: float = 1.0
+    explore_end: float = 0.1
+    explore_fraction: float = 0.5
+    explore_hold: float = 1.0
+    train_time_limit: int | None = None  # None: the environment's own; 0: none
+
+
+@dataclass
 class Suggest:
     """What suits an environment; the yaml files of learners and experience refer to it."""
 
@@ -26,6 +44,7 @@ class Suggest:
     n_episodes: int = 500
     episode_length: int = 1000
     learner: str | None = None  # that published S1 should give way to
+    network: Network = field(default_factory=Network)
 
 
 @dataclass

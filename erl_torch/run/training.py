@@ -57,6 +57,7 @@ from erl_torch.run.checkpoint import Checkpoints, failure_of
 from erl_torch.run.groups import Group, groups_of
 from erl_torch.run.judge import EvaluationSettings
 from erl_torch.run.loop import Run, SafePoint
+from erl_torch.run.networks import has_networks, network_parts
 from erl_torch.run.origin import shown
 from erl_torch.run.replicas import ReplicaRecorder
 from erl_torch.run.report import Title
@@ -64,7 +65,7 @@ from erl_torch.run.settings import check_keys
 from erl_torch.run.single import SingleRecorder
 
 # Of a run: learner, problem, experience, recorder, hyperparameters besides.
-Parts = tuple[Any, Problem, Any, Any, dict[str, Any]]
+Parts = tuple[Any, Any, Any, Any, dict[str, Any]]
 
 
 def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lambda: None) -> dict[str, Any]:
@@ -89,6 +90,7 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
         raise InputError("checkpoint_every", cfg.checkpoint_every, "seconds >= 0, or null")
     many = cfg.n_replicas > 1 or bool(cfg.vary)
     torch.set_num_threads(1 if many else cfg.threads or 1)
+    networks = has_networks(cfg.learner)
     if not kernels.compiled_before():
         print(announcement(), file=sys.stderr)
     settings = evaluation_settings(cfg.evaluation)
@@ -107,22 +109,13 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
         suited = cfg.env.get("suggest", {}).get("learner")
         if suited is not None and cfg.learner.name == "s1":
             note(f"{cfg.env.name} wants learner={suited}: published S1 does not learn it (docs/environments.md)")
-        log: Log | None = None
-        if is_log(cfg.env):
-            log, learner = make_log(cfg, safe_point)
-            problem = log.problem
-            print(f"{log.report}\n")
-        else:
-            env = stack.enter_context(contextlib.closing(make_env(cfg.env)))
-            learner, problem = _of_environment(cfg, env, safe_point)
-        learner, problem, experience, recorder, more = (_replicas if many else _single)(
-            cfg, learner, problem, log, settings, safe_point
-        )
+        parts = network_parts(cfg, settings, many) if networks else _of_tables(cfg, settings, many, stack, safe_point)
+        learner, problem, experience, recorder, more = parts
         run: Run[Any, Any, Any] = Run(
             learner=learner,
             problem=problem,
             experience=experience,
-            digest=digest(experience),
+            digest=None if networks else digest(experience),
             recorder=recorder,
             saved=saved,
             hyperparameters=hyperparameters(plain(cfg), shown(directory), **more),
@@ -134,6 +127,25 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
         )
         _, result = run.perform(notes)
         return result
+
+
+def _of_tables(
+    cfg: DictConfig,
+    settings: EvaluationSettings,
+    many: bool,
+    stack: contextlib.ExitStack,
+    safe_point: SafePoint,
+) -> Parts:
+    """Of a run of learners of tables; ``stack`` closes its environment."""
+    log: Log | None = None
+    if is_log(cfg.env):
+        log, learner = make_log(cfg, safe_point)
+        problem = log.problem
+        print(f"{log.report}\n")
+    else:
+        env = stack.enter_context(contextlib.closing(make_env(cfg.env)))
+        learner, problem = _of_environment(cfg, env, safe_point)
+    return (_replicas if many else _single)(cfg, learner, problem, log, settings, safe_point)
 
 
 def _of_environment(
