@@ -113,7 +113,10 @@ def test_kernels_call_those_of_their_own_file():
 CONFIGURED = {
     "hydra": {"cli"},
     "omegaconf": {"cli", "reproduction.runner"}
-    | {f"run.{name}" for name in ("build", "classes", "compare", "origin", "playing", "settings", "training")},
+    | {
+        f"run.{name}"
+        for name in ["build", "classes", "compare", "networks", "origin", "playing", "settings", "training"]
+    },
 }
 
 

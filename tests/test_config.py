@@ -77,7 +77,7 @@ def test_keys_are_the_arguments_of_the_class(path):
     if "class" in text:
         kind = classes.resolve(text["class"], "class")
         if path.parent.name == "learner":
-            assert kind is LEARNERS[path.stem]
+            assert kind is LEARNERS.get(path.stem, kind)  # others are of networks
     elif path.stem == "log":  # no environment: what read_log is told of it
         assert keys - {"end_target"} < set(inspect.signature(read_log).parameters)
         return
@@ -242,7 +242,7 @@ def test_unknown_keys_get_one_line(tmp_path, group, plus):
 @pytest.mark.parametrize(
     ("overrides", "expected"),
     [
-        (["env=cliff"], "env=cliff: must be access_control or acrobot or admission or car_rental or cart_pole or"),
+        (["env=cliff"], "env=cliff: must be access_control or acrobot or acrobot_v1 or admission or car_rental or"),
         (["env=gym"], "env.id=???: must be given, as in env.id=VALUE"),
         (["experience=recorded"], "experience.path=???: must be given, as in experience.path=VALUE"),
         (["learner.beta="], "learner.beta="),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -21,7 +21,7 @@ START_LOW, START_HIGH = np.array([0.2, 0.0]), np.array([0.4, 0.1])
 LEAST = 1e-14  # probabilities of cells below this are left out
 
 
-class WindyStripEnv(gym.Env[np.ndarray, int]):
+class WindyStripEnv(gym.Env[Any, Any]):
     """Walk along a cliff in gusts of wind.
 
     ## Description
@@ -52,8 +52,6 @@ class WindyStripEnv(gym.Env[np.ndarray, int]):
     ## Version History
     v0: first version.
     """
-
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": []}
 
     def __init__(self, render_mode: str | None = None) -> None:
         checks.one_of("render_mode", str(render_mode), ("None",))

@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import numpy as np
 import torch
+from typing_extensions import TypeVar as Defaulting
 
 from erl_torch import checks
 from erl_torch.experience.experience import EXPERIENCE, Experience, check_unweighted, permitted
@@ -38,16 +39,16 @@ class NonFiniteError(ArithmeticError):
 class State(Protocol):
     """What a learner knows after an epoch: a value, never changed in place."""
 
-    @property
-    def policy(self) -> Policy:
-        """The policy that it stands for."""
-
     def metrics(self) -> Mapping[str, Metric]:
         """What is logged, by name (docs/logging.md): the same names in every state of a run."""
 
 
 class TabularState(State, Protocol):
     """The state of one learner of tables."""
+
+    @property
+    def policy(self) -> Policy:
+        """The policy that it stands for."""
 
     @property
     def theta(self) -> float | None:
@@ -76,10 +77,11 @@ S = TypeVar("S", bound=State)
 T = TypeVar("T", bound=StreamState)
 E = TypeVar("E", contravariant=True)  # kind of experience
 A = TypeVar("A", covariant=True)  # kind of solution
+P = Defaulting("P", contravariant=True, default=Problem)  # kind of problem
 Prepared = TypeVar("Prepared")
 
 
-class Learner(Protocol[S, E, A]):
+class Learner(Protocol[S, E, A, P]):
     """What a run asks of a learner: a frozen dataclass whose fields are its settings, checked when it is made."""
 
     unit: ClassVar[str]  # what ``position`` counts: "tuples", or "iterations" of a solver
@@ -89,11 +91,11 @@ class Learner(Protocol[S, E, A]):
     def states(self) -> tuple[type, ...]:
         """Classes that its states are made of: what a checkpoint of it may hold."""
 
-    def start(self, problem: Problem) -> S:
+    def start(self, problem: P) -> S:
         """The state before anything is learnt: its policy is the prior. Raises InputError for a prior of other sizes,
         or a problem that it cannot learn or solve."""
 
-    def run(self, problem: Problem, experience: E | None, state: S | None = None) -> Iterator[S]:
+    def run(self, problem: P, experience: E | None, state: S | None = None) -> Iterator[S]:
         """Yield the state after each epoch, from ``state`` on, until the learner is finished.
 
         Raises:

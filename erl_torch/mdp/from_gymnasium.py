@@ -90,7 +90,8 @@ def space_labels(key: str, space: gym.Space[Any]) -> SpaceLabels:
     try:
         return Labels.of_space(space)
     except InputError as error:
-        hint = "" if key == "action_space" else " (a Box can be cut: env.bins, or erl_torch.envs.Discretise)"
+        ways = " (a Box can be cut: env.bins, or erl_torch.envs.Discretise; learner=deep_s1 takes it as it is)"
+        hint = "" if key == "action_space" else ways
         raise InputError(key, error.value, f"{error.allowed}{hint}") from error
 
 

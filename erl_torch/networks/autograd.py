@@ -21,7 +21,7 @@ def drawn(random: np.ndarray, size: int, n: int) -> np.ndarray:
         z = (z ^ (z >> np.uint64(30))) * FIRST
         z = (z ^ (z >> np.uint64(27))) * SECOND
         z = z ^ (z >> np.uint64(31))
-    return ((z >> np.uint64(11)) * (1.0 / 9007199254740992.0) * n).astype(np.int64)
+    return np.asarray((z >> np.uint64(11)) * (1.0 / 9007199254740992.0) * n).astype(np.int64)
 
 
 def advance(
@@ -33,11 +33,7 @@ def advance(
     v: torch.Tensor,
     numbers: np.ndarray,
     random: np.ndarray,
-    observation: torch.Tensor,
-    action: torch.Tensor,
-    reward: torch.Tensor,
-    following: torch.Tensor,
-    ended: torch.Tensor,
+    columns: tuple[torch.Tensor, ...],
     n: int,
     n_updates: int,
     batch: int,
@@ -53,7 +49,9 @@ def advance(
     episodic: bool,
     limit: float,
 ) -> None:
-    """As ``kernels.advance``, with the layouts of Q and V (None: no network of V) in the place of sizes."""
+    """As ``kernels.advance``, with the layouts of Q and V (None: no network of V) in the place of sizes, and the five
+    columns of tuples in one."""
+    observation, action, reward, following, ended = columns
     separate, size_q = v_layout is not None, q_layout.size
     prior = log_prior.to(weights.dtype)
     for _ in range(n_updates):

@@ -32,7 +32,7 @@ class Layout:
         """(W, b) of each layer, views of ``vector`` [..., size]; leading dimensions stay."""
         found, at = [], 0
         for n, m in self._pairs():
-            weight = vector[..., at : at + n * m].unflatten(-1, (n, m))
+            weight = vector[..., at : at + n * m].reshape(*vector.shape[:-1], n, m)
             found.append((weight, vector[..., at + n * m : at + (n + 1) * m]))
             at += (n + 1) * m
         return found

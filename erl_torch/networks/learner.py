@@ -1,15 +1,16 @@
 """Average-reward learners with networks, for Discrete actions: ``DeepS1`` and ``AverageSoftQ``.
 
 Both have the fixed point of the tables' problem, Q = r + E V(s'), V = (1/beta) log sum_a pi0 exp(beta Q) - g, by the
-squared loss, whose minimum is a mean: nothing is clipped, and no loss is Huber's, whose minimum is none (theory page, 11).
-``DeepS1`` fits r + V(s') with a lagged V, and V by a network of its own, as S1 has <log psi> beside psi;
-``AverageSoftQ`` (average-reward soft Q-learning, ASQL) has V from the lagged Q. Where the truth is known they are a draw.
+squared loss, whose minimum is a mean: nothing is clipped, and no loss is Huber's, whose minimum is none (theory page,
+11). ``DeepS1`` fits r + V(s') with a lagged V, and V by a network of its own, as S1 has <log psi> beside psi;
+``AverageSoftQ`` (average-reward soft Q-learning, ASQL) has V from the lagged Q. Where the truth is known they are a
+draw.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -24,7 +25,7 @@ from erl_torch.networks.layout import Layout, mlp
 from erl_torch.networks.live import Exploration, Live, Walk
 from erl_torch.networks.policy import NetworkPolicy
 from erl_torch.networks.problem import BoxProblem
-from erl_torch.networks.replay import Replay, Steps
+from erl_torch.networks.replay import COLUMNS, Replay, Steps
 from erl_torch.solution import Status
 
 LIMIT = 3.0  # the slope of the exponential loss is capped at exp(LIMIT)
@@ -106,8 +107,8 @@ class NetworkLearner:
         updates_per_step: >= 1; the first one comes when a batch is stored.
         replay_size: tuples kept; None is all.
         explore_start, explore_end, explore_fraction, explore_hold: ``Exploration``.
-        on_termination: "restart": an end leads to where the next episode begins, the average-reward problem; "episodic":
-            an end is worth 0 and there is no rate, the undiscounted problem of one episode.
+        on_termination: "restart": an end leads to where the next episode begins, the average-reward problem;
+            "episodic": an end is worth 0 and there is no rate, the undiscounted problem of one episode.
         train_time_limit: steps of an episode while it learns; None is the environment's own limit, 0 is none.
         reward_scale: factor of rewards in the networks, > 0; beta, theta and penalties are of the rewards as they are.
         support_penalty: weight of staying near the recorded actions (conservative Q-learning's form), reward, >= 0.
@@ -251,7 +252,7 @@ class NetworkLearner:
         log_prior = np.full(problem.n_actions, -math.log(problem.n_actions))
         walk, replay = state.walk, state.replay
         if live is None:
-            self._updates(problem, replay, weights, lagged, m, v, numbers, random, log_prior, n)(replay.n, n)
+            self._updates(problem, replay, weights, lagged, m, v, numbers, random, log_prior, self.n_steps)(replay.n, n)
         else:
             assert walk is not None
             replay = replay.with_room(n)
@@ -281,7 +282,7 @@ class NetworkLearner:
         lr_end = self.lr * self.lr_end_fraction
         if self.compiled:
             arrays = [x.numpy() for x in (weights, lagged, m, v)]
-            fixed = [getattr(replay, name) for name in ("observation", "action", "reward", "following", "ended")]
+            fixed = [getattr(replay, name) for name in COLUMNS]
             draws = random.view(np.uint64)
             tail = (
                 *self.hidden, self.batch, self.separate, beta, kappa, log_prior, float(self.lr), lr_end, n_total,
@@ -293,17 +294,14 @@ class NetworkLearner:
 
             return compiled
         q, value = self.layouts(problem)
-        columns = [
-            torch.from_numpy(getattr(replay, name))
-            for name in ("observation", "action", "reward", "following", "ended")
-        ]
+        columns = tuple(torch.from_numpy(getattr(replay, name)) for name in COLUMNS)
         prior = torch.from_numpy(log_prior)
         draws = random.view(np.uint64)
 
         def plain(stored: int, n: int) -> None:
             autograd.advance(
-                q, value, weights, lagged, m, v, numbers, draws, *columns, stored, n, self.batch, beta, kappa,
-                prior, self.lr, lr_end, n_total, self.tau, self.g_rate, penalty, episodic, LIMIT,
+                q, value, weights, lagged, m, v, numbers, draws, columns, stored, n, self.batch, beta, kappa, prior,
+                self.lr, lr_end, n_total, self.tau, self.g_rate, penalty, episodic, LIMIT,
             )  # fmt: skip
 
         return plain
@@ -327,7 +325,10 @@ class NetworkLearner:
         """What is logged of ``state``, whose last epoch had ``n`` steps."""
         numbers, scale = state.numbers, self.reward_scale
         count = numbers[kernels.SUMMED]
-        mean = (lambda place: float(numbers[place] / count)) if count else (lambda place: math.nan)
+
+        def mean(place: int) -> float:
+            return float(numbers[place] / count) if count else math.nan
+
         replay = state.replay
         recent = np.arange(replay.at - min(n, replay.n), replay.at) % len(replay.reward)
         rows = torch.from_numpy(replay.observation[recent])

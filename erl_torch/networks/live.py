@@ -96,7 +96,7 @@ class Live:
         actions = np.zeros((0, k), np.float32) if k else np.zeros(0, np.int32)
         action = np.zeros(k, np.float32) if k else np.zeros((), np.int32)
         observation = self._reset(0)
-        self._at = Walk(0, 0, actions, observation, 0, action, rng.bit_generator.state, 0.0, ())
+        self._at = Walk(0, 0, actions, observation, 0, action, dict(rng.bit_generator.state), 0.0, ())
         return self._at
 
     def _reset(self, episode: int) -> np.ndarray:
@@ -163,7 +163,8 @@ class Live:
         rows, at, stored = len(replay.reward), replay.at, replay.n
         now = walk.observation.reshape(1, -1).copy()
         taken = list(walk.actions)
-        held, action, episode, total = walk.held, walk.action, walk.episode, walk.episode_return
+        held, episode, total = walk.held, walk.episode, walk.episode_return
+        action: Any = walk.action
         returns = []
         limit = time_limit or 0
         low, high = np.array(problem.low, np.float32), np.array(problem.high, np.float32)
@@ -198,8 +199,8 @@ class Live:
         kind = walk.actions.dtype
         actions = np.array(taken, kind).reshape(len(taken), *walk.actions.shape[1:])
         walk = Walk(
-            walk.n_steps + n, episode, actions, now[0].copy(), held, np.asarray(action, kind), rng.bit_generator.state,
-            total, tuple(returns),
+            walk.n_steps + n, episode, actions, now[0].copy(), held, np.asarray(action, kind),
+            dict(rng.bit_generator.state), total, tuple(returns),
         )  # fmt: skip
         self._at = walk
         return walk, replace(replay, n=stored, at=at)

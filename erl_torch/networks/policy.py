@@ -17,6 +17,7 @@ from erl_torch.checks import InputError
 from erl_torch.files import write_bytes
 from erl_torch.networks.layout import Layout
 
+KEY = "erl_torch"  # of the metadata of a file
 Probabilities = Callable[[np.ndarray], np.ndarray]
 
 
@@ -43,20 +44,20 @@ class NetworkPolicy:
         return torch.softmax(self.beta * self.action_values(observation).double(), 1).numpy()
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write a safetensors file: a weight and a bias for each layer, ``beta`` among the metadata."""
-        layers = {}
+        """Write a safetensors file: a weight and a bias for each layer, ``beta`` in its metadata."""
+        layers: dict[str, torch.Tensor] = {}
         for i, (weight, bias) in enumerate(self.layout.layers(self.weights)):
             layers |= {f"layer{i}.weight": weight.T.contiguous(), f"layer{i}.bias": bias.contiguous()}
-        told = {"beta": repr(float(self.beta)), "widths": json.dumps(self.layout.widths), "policy": "softmax(beta * Q)"}
-        return write_bytes(path, save(layers, told))
+        told = {"policy": "softmax(beta * Q)", "beta": float(self.beta), "widths": self.layout.widths}
+        return write_bytes(path, save(layers, {KEY: json.dumps(told)}))  # of several keys the order is by chance
 
 
 def load_policy(path: str | os.PathLike[str]) -> NetworkPolicy:
     """What ``save`` wrote. Raises InputError for another file."""
     try:
         with safe_open(str(path), "pt") as file:
-            told = file.metadata() or {}
-            layout = Layout(tuple(map(int, json.loads(told["widths"]))))
+            told = json.loads((file.metadata() or {})[KEY])
+            layout = Layout(tuple(map(int, told["widths"])))
             parts = []
             for i in range(len(layout.widths) - 1):
                 parts += [file.get_tensor(f"layer{i}.weight").T.reshape(-1), file.get_tensor(f"layer{i}.bias")]

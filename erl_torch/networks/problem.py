@@ -15,7 +15,9 @@ Environment = gym.Env[Any, Any]
 
 
 class Truth(Protocol):
-    """What judges a policy exactly, where a model of the environment is known."""
+    """What judges a policy exactly, where a model of the environment is known; ``optimum`` is that of the best one."""
+
+    optimum: dict[str, float]
 
     def figures(self, probabilities: Callable[[np.ndarray], np.ndarray]) -> dict[str, float]:
         """By name: "objective", "gap", "kl", "theta" (of the optimum) and others, of the policy that gives the

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -85,7 +86,8 @@ class Replay:
     @classmethod
     def of(cls, steps: Steps) -> Replay:
         """All of ``steps``."""
-        return cls(*(getattr(steps, name) for name in COLUMNS), len(steps), len(steps), len(steps))
+        n = len(steps)
+        return cls(steps.observation, steps.action, steps.reward, steps.following, steps.ended, n, n, n)
 
     def with_room(self, more: int) -> Replay:
         """The same tuples, with room for ``more``, which the caller writes from ``at`` on, around the end."""
@@ -97,7 +99,7 @@ class Replay:
         return self._copied(min(self.capacity, max(2 * rows, self.n + more)))
 
     def _copied(self, rows: int) -> Replay:
-        columns = {}
+        columns: dict[str, Any] = {}
         for name in COLUMNS:
             old = getattr(self, name)
             columns[name] = np.zeros((rows, *old.shape[1:]), old.dtype)

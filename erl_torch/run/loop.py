@@ -15,6 +15,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 from tqdm import tqdm
+from typing_extensions import TypeVar as Defaulting
 
 from erl_torch.checks import InputError
 from erl_torch.files import write_json
@@ -32,6 +33,7 @@ Row = Mapping[str, Any]  # of the history: ``metrics()`` of a state
 S = TypeVar("S", bound=State)
 E = TypeVar("E")
 A = TypeVar("A")
+P = Defaulting("P", default=Problem)
 
 
 @dataclass
@@ -101,7 +103,7 @@ class Recorder(Protocol[S, A]):
 
 
 @dataclass(frozen=True, eq=False)
-class Run(Generic[S, E, A]):
+class Run(Generic[S, E, A, P]):
     """Everything that a run is made of.
 
     Args:
@@ -119,8 +121,8 @@ class Run(Generic[S, E, A]):
         began: ``time.perf_counter()`` when the run began.
     """
 
-    learner: Learner[S, E, A]
-    problem: Problem
+    learner: Learner[S, E, A, P]
+    problem: P
     experience: E | None
     digest: object
     recorder: Recorder[S, A]

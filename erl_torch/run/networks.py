@@ -33,12 +33,17 @@ from erl_torch.run.classes import resolve
 from erl_torch.run.groups import Group, Record
 from erl_torch.run.judge import EvaluationSettings
 from erl_torch.run.loop import Outcome, Row
-from erl_torch.run.report import Title, at, headline, last_rows, plural, versions
 from erl_torch.run.replicas import one_group
+from erl_torch.run.report import Title, at, headline, last_rows, plural, versions
 
 TABLE = with_own(NETWORK_QUANTITIES)
-SMALL_RESIDUAL = 0.05  # nats below log A, above which a policy is called saturated
+SATURATED = 0.05  # nats below log A, from which on a policy is called nearly deterministic
 FILE = "policy.safetensors"
+
+
+def of_seed(seed: int) -> str:
+    """The file of the policy of one replica."""
+    return f"policy-{seed}.safetensors"
 
 
 def has_networks(cfg: DictConfig) -> bool:
@@ -161,7 +166,9 @@ class NetworkRecorder:
 
     def line(self) -> str:
         shown = ("objective", "loss_of_policy", "return", "return_greedy")
-        return "  ".join(f"{name.replace('_', ' ')} {self.last[name].mean():.4f}" for name in shown if name in self.last)
+        return "  ".join(
+            f"{name.replace('_', ' ')} {self.last[name].mean():.4f}" for name in shown if name in self.last
+        )
 
     # -- checkpoints ----------------------------------------------------------------------------------
 
@@ -193,17 +200,20 @@ class NetworkRecorder:
         if self.many:
             board.scalars(self.recorded.final(), solution.n_steps)
         else:
-            board.scalars(tagged("Final", {**self._one(self.last), "theta": float(solution.theta[0])}), solution.n_steps)
+            board.scalars(
+                tagged("Final", {**self._one(self.last), "theta": float(solution.theta[0])}), solution.n_steps
+            )
         return solution
 
     def _notes(self, outcome: Outcome[NetworkState | SeedsState]) -> list[str]:
         """What a reader of the figures should know."""
         each, found = _each(outcome.state), []
         kl = max(one.figures["kl"] for one in each)
-        if kl > np.log(self.problem.n_actions) - SMALL_RESIDUAL:
+        most = float(np.log(self.problem.n_actions))
+        if kl > most - SATURATED:
             found.append(
-                f"the policy is nearly deterministic (KL to the prior {kl:.3g} of at most {np.log(self.problem.n_actions):.3g}"
-                " nats a step): differences of action values beyond that say nothing; a smaller beta keeps them apart"
+                f"the policy is nearly deterministic (KL to the prior {kl:.3g} of at most {most:.3g} nats a step); a "
+                "smaller beta keeps actions apart that are nearly as good"
             )
         replay = each[0].replay
         reward = replay.reward[: replay.n]
@@ -213,16 +223,20 @@ class NetworkRecorder:
                 "env.end_reward makes the ends count"
             )
         if self.learner.optimism:
-            found.append("optimism: the slope of the loss is capped, so that its fixed point is near that of the exact solver only")
+            found.append("optimism: the slope of the loss is capped, which moves its fixed point")
         return found
 
     def save(self, solution: NetworkSolution, directory: Path) -> None:
         for seed, state in zip(self.seeds, solution.states, strict=True):
-            self.learner.policy(self.problem, state).save(directory / (f"policy-{seed}.safetensors" if self.many else FILE))
+            self.learner.policy(self.problem, state).save(
+                directory / (f"policy-{seed}.safetensors" if self.many else FILE)
+            )
         if self.many:
             write_npz(directory / "replicas.npz", self.recorded.arrays() | {"seeds": np.array(self.seeds)})
             shown = {name: lines for name, lines in self.recorded.curves().items() if lines}
-            write_png(directory / "bands.png", pictures.bands(shown, f"{self.title.env}, {self.title.learner}", "steps"))
+            write_png(
+                directory / "bands.png", pictures.bands(shown, f"{self.title.env}, {self.title.learner}", "steps")
+            )
 
     def failed(self, solution: NetworkSolution) -> NonFiniteError | None:
         """The error has ended the run already."""
@@ -242,9 +256,15 @@ class NetworkRecorder:
             **results({"theta": theta, "reward_per_step": None, "objective": None, "return": None} | means),
             "return_greedy": means.get("return_greedy"),
             "exact_theta": self._optimum().get("theta"),
-            **{name: means.get(name) for name in ("loss_of_policy", "kl_to_optimal", "falls", "arrivals") if name in means},
+            **{
+                name: means.get(name)
+                for name in ("loss_of_policy", "kl_to_optimal", "falls", "arrivals")
+                if name in means
+            },
             "n_steps": solution.n_steps,
-            "end_reward": f"{self.problem.end_reward:+g} at every end; not in the return" if self.problem.end_reward else None,
+            "end_reward": f"{self.problem.end_reward:+g} at every end; not in the return"
+            if self.problem.end_reward
+            else None,
             "seconds_learning": round(outcome.seconds, 3),
             "versions": versions(),
         }
@@ -291,11 +311,12 @@ def network_parts(
     if cfg.vary:
         raise InputError("vary", dict(cfg.vary), "{}, for learners with networks: sweep with -m learner.KEY=A,B")
     if cfg.experience.name != "simulate":
-        raise InputError("experience", cfg.experience.name, "simulate: learners with networks step the environment themselves")
+        raise InputError(
+            "experience", cfg.experience.name, "simulate: learners with networks step the environment themselves"
+        )
     problem = make_network_problem(cfg)
     learner: NetworkLearner = made(cfg.learner, resolve(cfg.learner["class"], "learner.class"), "learner")
-    with group("learner"):
-        learner.check(problem)
+    learner.check(problem)
     truth = None
     kind = TRUTHS.get(str(cfg.env.get("id")))
     if kind is not None and settings.certify:

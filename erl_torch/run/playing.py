@@ -21,14 +21,16 @@ from erl_torch.labels import Names
 from erl_torch.learners.replicas import ReplicaSolution
 from erl_torch.mdp.from_gymnasium import sizes
 from erl_torch.mdp.tabular import check_policy
+from erl_torch.networks.policy import load_policy
 from erl_torch.rng import streams
-from erl_torch.run.build import is_log, make_env, reads_table
+from erl_torch.run.build import is_log, make_env, raw_env, reads_table
 from erl_torch.run.classes import is_own
+from erl_torch.run.networks import FILE, has_networks, make_network_problem, of_seed
 from erl_torch.run.settings import Play, check_keys
 from erl_torch.solution import Solution
 
 RUNS = Path("runs")
-TABLES = ("solution.npz", "replicas.npz")
+TABLES = ("solution.npz", "replicas.npz", FILE)
 MODES = {"ansi": "ansi", "gif": "rgb_array"}  # Gymnasium's names
 SHOWN = {"ansi": 10, "gif": 200}  # steps
 
@@ -61,8 +63,11 @@ def play(cfg: DictConfig) -> Played:
     if is_log(settings.env):
         allowed = f"one with an environment: a log alone has none to play in; its policy is in {run / 'policy.csv'}"
         raise InputError("run", run, allowed)
-    table = run_policy(run, cfg.replica)
     mode = MODES.get(cfg.render)
+    if has_networks(settings.learner):
+        played, fps = _of_network(cfg, settings, run)
+        return _told(cfg, settings, run, played, fps)
+    table = run_policy(run, cfg.replica)
     with contextlib.closing(make_env(settings.env)) as plain:
         n_states, n_actions = sizes(plain)
         modes = plain.metadata.get("render_modes") or []
@@ -82,6 +87,11 @@ def play(cfg: DictConfig) -> Played:
         masked = not reads_table(settings.env, env) or bool(settings.env.get("use_action_mask"))
         played = episodes(env, table, cfg.n_episodes, settings.evaluation.horizon, cfg.seed, n_shown, masked)
         fps = env.metadata.get("render_fps", 10)
+    return _told(cfg, settings, run, played, fps)
+
+
+def _told(cfg: DictConfig, settings: DictConfig, run: Path, played: Played, fps: float) -> Played:
+    """``played``, printed, and drawn where ``cfg`` asks for it."""
     head = f"{settings.env.name}, {settings.learner.name}" + ("" if cfg.replica is None else f", replica {cfg.replica}")
     print(_report(f"{head}{', greedy' * cfg.greedy}, seed {cfg.seed} ({run})", played))
     if cfg.render == "ansi" and played.shown:
@@ -92,6 +102,49 @@ def play(cfg: DictConfig) -> Played:
         path = write_gif(run / f"episode{which}-seed-{cfg.seed}.gif", played.shown, fps)
         print(f"{'picture':18}{path}")
     return played
+
+
+def _of_network(cfg: DictConfig, settings: DictConfig, run: Path) -> tuple[Played, float]:
+    """Episodes of the network that ``run`` learnt, and pictures a second. Raises InputError."""
+    name = FILE
+    if not (run / FILE).is_file():
+        replica = cfg.replica or 0
+        if not 0 <= replica < settings.n_replicas:
+            raise InputError("replica", replica, f"a whole number in [0, {settings.n_replicas})")
+        name = of_seed(settings.seed + replica)
+    elif cfg.replica is not None:
+        raise InputError("replica", cfg.replica, f"left out: {run} holds one policy")
+    policy, problem = load_policy(run / name), make_network_problem(settings)
+    if (problem.n_observation, problem.n_actions) != (policy.layout.widths[0], policy.layout.widths[-1]):
+        raise InputError("run", run, "one whose policy fits its environment")
+    mode = MODES.get(cfg.render)
+    with contextlib.closing(raw_env(settings.env)) as plain:
+        modes = plain.metadata.get("render_modes") or []
+    if cfg.render == "gif" and mode not in modes:
+        raise InputError("render", "gif", f"ansi or none: {settings.env.name} draws no pictures")
+    drawn = {"render_mode": mode} if mode in modes else {}
+    n_shown = 0 if cfg.render == "none" else cfg.n_steps or SHOWN[cfg.render]
+    n, horizon = cfg.n_episodes, settings.evaluation.horizon
+    returns, lengths, ended = np.zeros(n), np.zeros(n, np.int64), np.zeros(n, bool)
+    shown: list[Any] = []
+    with contextlib.closing(raw_env(settings.env, **drawn)) as env:
+        for i, own in enumerate(np.random.SeedSequence([cfg.seed, 3]).spawn(n)):
+            rng = np.random.default_rng(own)
+            observation, _ = env.reset(seed=int(rng.integers(2**31)))
+            if i == 0 and n_shown:
+                shown.append(env.render() if drawn else str(observation))
+            over = False
+            while not over and lengths[i] < horizon:
+                p = policy(np.asarray(observation, np.float32).reshape(1, -1))[0]
+                a = int(p.argmax() if cfg.greedy else rng.choice(len(p), p=p))
+                observation, reward, terminated, truncated, _ = env.step(a + problem.first_action)
+                returns[i] += float(reward)
+                lengths[i] += 1
+                ended[i], over = terminated, terminated or truncated
+                if i == 0 and lengths[0] <= n_shown:
+                    line = f"a={a}, r={float(reward):g}, {observation}{', the end' * bool(terminated)}"
+                    shown.append(env.render() if drawn else line)
+        return Played(returns, lengths, ended, shown), env.metadata.get("render_fps", 10)
 
 
 def _check_named(cfg: DictConfig, settings: DictConfig, run: Path) -> None:
