@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -209,6 +210,6 @@ def test_lost_weights_are_told_and_the_last_good_ones_kept(tmp_path):
         run(tmp_path, "env=windy_strip", "learner=asql", "learner.lr=1e30")
     result = json.loads((tmp_path / "result.json").read_text())
     assert result["status"] == "non_finite"
-    policy = load_policy(tmp_path / "policy.safetensors")
+    policy: Any = load_policy(tmp_path / "policy.safetensors")
     assert np.isfinite(policy(np.zeros((1, 2), np.float32))).all()
     assert replace(policy, beta=1.0).beta == 1.0

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -16,7 +17,7 @@ from erl_torch.networks.episodes import Stage
 from erl_torch.networks.layout import mlp
 from erl_torch.networks.learner import LIMIT, AverageSoftQ, DeepS1
 from erl_torch.networks.live import Exploration, Live
-from erl_torch.networks.policy import NetworkPolicy, load_policy, uniform
+from erl_torch.networks.policy import NetworkPolicy, Prior, load_policy
 from erl_torch.networks.problem import BoxProblem
 from erl_torch.networks.replay import COLUMNS, Replay, Steps
 from erl_torch.networks.seeds import Seeds
@@ -204,8 +205,13 @@ def cliff_steps(n, seed):
     return mdp, Steps(one[s], a, r, one[after], np.zeros(n, bool))
 
 
+def table(mdp, learner, where, state):
+    policy: Any = learner.policy(where, state)
+    return policy(np.eye(mdp.n_states, dtype=np.float32))
+
+
 def gap(mdp, learner, where, state):
-    policy = learner.policy(where, state)(np.eye(mdp.n_states, dtype=np.float32))
+    policy = table(mdp, learner, where, state)
     return worth(mdp, solve_soft_bellman(mdp, 10.0).policy.numpy()) - worth(mdp, policy)
 
 
@@ -239,7 +245,7 @@ def test_the_cliff_is_learnt_and_optimism_is_where_theory_puts_it(kind):
         hopeful = solve_soft_bellman(mdp, 10.0, optimism=1.0).policy.numpy()
         best = solve_soft_bellman(mdp, 10.0).policy.numpy()
         assert worth(mdp, best) - worth(mdp, hopeful) == pytest.approx(0.371, abs=1e-3)
-        policy = optimistic.policy(where, state)(np.eye(mdp.n_states, dtype=np.float32))
+        policy = table(mdp, optimistic, where, state)
         assert divergence(mdp, hopeful, policy) < 0.02
         assert divergence(mdp, best, policy) > 0.3
         assert gap(mdp, optimistic, where, state) > 0.3
@@ -426,14 +432,15 @@ def test_the_schedule_goes_down_on_a_line():
 
 def test_episodes_begin_alike_for_every_policy():
     stage = Stage(problem(), 6, 30, 0)
-    first, again = (stage.play(uniform(3), False) for _ in range(2))
+    first, again = (stage.play(Prior(3), False) for _ in range(2))
     assert np.array_equal(first.returns, again.returns)
     assert first.kl == pytest.approx(0.0, abs=1e-12)
 
-    def right(observation):
-        return np.tile([0.0, 0.0, 1.0], (len(observation), 1))
+    class Right:
+        def draw(self, observation, uniform):
+            return np.full(len(observation), 2), np.full(len(observation), math.log(3))
 
-    to_the_right = stage.play(right, False)
+    to_the_right = stage.play(Right(), False)
     assert to_the_right.kl == pytest.approx(math.log(3))
     assert to_the_right.ended.all()
     assert to_the_right.steps.max() < first.steps.max()
@@ -490,7 +497,8 @@ def test_a_policy_is_saved_and_read(tmp_path):
     policy = NetworkPolicy(layout, torch.from_numpy(layout.start(np.random.default_rng(0))), 3.25)
     path = policy.save(tmp_path / "policy.safetensors")
     x = np.random.default_rng(1).normal(size=(30, 4)).astype(np.float32)
-    assert np.array_equal(load_policy(path)(x), policy(x))
+    again: Any = load_policy(path)
+    assert np.array_equal(again(x), policy(x))
     from safetensors.torch import load_file
 
     layers, hidden = load_file(path), torch.from_numpy(x)  # as a user reads it, without the package

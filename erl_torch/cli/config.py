@@ -16,7 +16,7 @@ from erl_torch import configurations
 from erl_torch.cli.paths import quoted
 from erl_torch.run.settings import Compare, Play, Reproduce, Standard, Suggest, Train
 
-NOT_COMPARED = ("exact", "deep_s1", "asql")  # they learn from no stream of tuples with numbers of states
+NOT_COMPARED = ("exact", "deep_s1", "asql", "asac")  # they learn from no stream of tuples with numbers of states
 RECORDED = ("recorded", "erl_torch.experience.sources.Recorded")  # experience that needs no environment
 COMMANDS = {"train": Train, "compare": Compare, "reproduce": Reproduce, "play": Play}
 

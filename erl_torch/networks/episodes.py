@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from erl_torch.networks.policy import Probabilities
+from erl_torch.networks.policy import Acting
 from erl_torch.networks.problem import BoxProblem, Environment
 
 
@@ -39,7 +39,7 @@ class Stage:
         self._seeds = np.random.SeedSequence([seed, 2]).generate_state(n).tolist()
         self._environments: list[Environment] = []
 
-    def play(self, policy: Probabilities, greedy: bool) -> Played:
+    def play(self, policy: Acting, greedy: bool) -> Played:
         """The episodes of ``policy``, of its most probable actions where ``greedy``."""
         n, problem = self._n, self._problem
         if not self._environments:
@@ -49,17 +49,16 @@ class Stage:
         for i, env in enumerate(self._environments):
             now[i] = np.asarray(env.reset(seed=int(self._seeds[i]))[0], np.float32).reshape(-1)
         returns, steps, ended, total = np.zeros(n), np.zeros(n, np.int64), np.zeros(n, bool), 0.0
-        playing = np.arange(n)
+        playing, width = np.arange(n), max(1, len(problem.low))
         while len(playing):
-            p = policy(now[playing])
-            with np.errstate(divide="ignore", invalid="ignore"):
-                total += float(np.where(p > 0, p * np.log(p * problem.n_actions), 0.0).sum())
-            uniform = rng.random((n, 1))[playing]  # of each episode its own, however long the others are
-            drawn = np.minimum((np.cumsum(p, 1) <= uniform).sum(1), p.shape[1] - 1)
-            chosen = p.argmax(1) if greedy else drawn
+            uniform = rng.random((n, width))[playing]  # of each episode its own, however long the others are
+            chosen, kl = policy.draw(now[playing], uniform)
+            total += float(kl.sum())
+            chosen = policy.best(now[playing]) if greedy else chosen
             left = []
-            for i, a in zip(playing.tolist(), chosen.tolist(), strict=True):
-                observation, reward, terminated, truncated, _ = self._environments[i].step(a + problem.first_action)
+            for i, a in zip(playing.tolist(), chosen, strict=True):
+                taken = a if problem.low else int(a) + problem.first_action
+                observation, reward, terminated, truncated, _ = self._environments[i].step(taken)
                 now[i] = np.asarray(observation, np.float32).reshape(-1)
                 returns[i] += float(reward)
                 steps[i] += 1

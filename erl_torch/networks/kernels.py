@@ -250,3 +250,178 @@ def act(weights, h1, h2, log_prior, beta, observation, uniform):
             return a
         left -= p
     return last
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def _normal(random):
+    """A standard normal number (Box and Muller)."""
+    u = ((_next(random) >> np.uint64(11)) + 1.0) * (1.0 / 9007199254740992.0)
+    w = (_next(random) >> np.uint64(11)) * (1.0 / 9007199254740992.0)
+    return math.sqrt(-2.0 * math.log(u)) * math.cos(2.0 * math.pi * w)
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def _squashed(output, noise, drawn, surprise):
+    """Actions tanh(mean + sd noise) in (-1, 1), [B, k], into ``drawn``, of the actor's ``output`` [B, 2k]; and
+    log pi/prior, the prior uniform in (-1, 1)^k, [B], into ``surprise``."""
+    k = noise.shape[1]
+    for i in range(noise.shape[0]):
+        surprise[i] = 0.0
+        for j in range(k):
+            log_sd = -5.0 + 3.5 * (math.tanh(output[i, k + j]) + 1.0)
+            before = output[i, j] + math.exp(log_sd) * noise[i, j]
+            drawn[i, j] = math.tanh(before)
+            # log(1 - tanh^2) = 2 (log 2 - |x| - log(1 + exp(-2 |x|)))
+            size = abs(before)
+            slope = 2.0 * (math.log(2.0) - size - math.log1p(math.exp(-2.0 * size)))
+            density = -0.5 * noise[i, j] ** 2 - log_sd - 0.5 * math.log(2.0 * math.pi) - slope
+            surprise[i] += density + math.log(2.0)
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True)
+def advance_actor(
+    weights, lagged, m, v, numbers, random, observation, action, reward, following, ended, n, n_updates,
+    h1, h2, batch, separate, beta, centre, half, lr, lr_end, n_total, tau, g_rate, episodic,
+):  # fmt: skip
+    """As ``advance``, for actions in a box: two networks of Q, that of V where ``separate``, and the actor's.
+
+    ``centre`` and ``half`` [k] float32 take the ``action`` [N, k] to (-1, 1)^k. ``lagged`` is the copy of V, or,
+    without a network of V, of both Q. The actor has tanh(mean + sd noise), and gives mean and the measure of log sd.
+    """
+    d, k = observation.shape[1], action.shape[1]
+    n_in = d + k
+    size_q = (n_in + 1) * h1 + (h1 + 1) * h2 + h2 + 1
+    size_v = (d + 1) * h1 + (h1 + 1) * h2 + h2 + 1 if separate else 0
+    at_v, at_actor = 2 * size_q, 2 * size_q + size_v
+    f = np.float32
+    x, x2 = np.empty((batch, d), f), np.empty((batch, d), f)
+    pair, proposed, after = np.empty((batch, n_in), f), np.empty((batch, n_in), f), np.empty((batch, n_in), f)
+    a1, a2 = np.empty((batch, h1), f), np.empty((batch, h2), f)
+    e1, e2 = np.empty((2, batch, h1), f), np.empty((2, batch, h2), f)
+    p1, p2 = np.empty((batch, h1), f), np.empty((batch, h2), f)
+    c1, c2 = np.empty((batch, h1), f), np.empty((batch, h2), f)
+    d1, d2 = np.empty((batch, h1), f), np.empty((batch, h2), f)
+    q, value, error = np.empty((batch, 1), f), np.empty((batch, 1), f), np.empty((batch, 1), f)
+    both = np.empty((2, batch, 1), f)
+    lag = np.empty((2, batch, 1), f)
+    out, out2 = np.empty((batch, 2 * k), f), np.empty((batch, 2 * k), f)
+    error_actor = np.empty((batch, 2 * k), f)
+    into = np.empty((batch, n_in), f)
+    noise, drawn, surprise = np.empty((batch, k)), np.empty((batch, k)), np.empty(batch)
+    noise2, drawn2, surprise2 = np.empty((batch, k)), np.empty((batch, k)), np.empty(batch)
+    worth, next_value = np.empty(batch), np.empty(batch)
+    slope = np.empty(weights.size, f)
+    chosen = np.empty(batch, np.int64)
+    actor = weights[at_actor:]
+    for _ in range(n_updates):
+        for i in range(batch):
+            at = np.int64((_next(random) >> np.uint64(11)) * (1.0 / 9007199254740992.0) * n)
+            chosen[i] = at
+            for j in range(d):
+                x[i, j] = observation[at, j]
+                x2[i, j] = following[at, j]
+                pair[i, j] = x[i, j]
+                proposed[i, j] = x[i, j]
+                after[i, j] = x2[i, j]
+            for j in range(k):
+                pair[i, d + j] = (action[at, j] - centre[j]) / half[j]
+        for i in range(batch):
+            for j in range(k):
+                noise[i, j] = _normal(random)
+        _forward(actor, d, h1, h2, 2 * k, x, p1, p2, out)
+        _squashed(out, noise, drawn, surprise)
+        for i in range(batch):
+            for j in range(k):
+                proposed[i, d + j] = drawn[i, j]
+        # What comes next.
+        if separate:
+            _forward(lagged, d, h1, h2, 1, x2, a1, a2, value)
+            for i in range(batch):
+                next_value[i] = value[i, 0]
+        else:
+            for i in range(batch):
+                for j in range(k):
+                    noise2[i, j] = _normal(random)
+            _forward(actor, d, h1, h2, 2 * k, x2, a1, a2, out2)
+            _squashed(out2, noise2, drawn2, surprise2)
+            for i in range(batch):
+                for j in range(k):
+                    after[i, d + j] = drawn2[i, j]
+            _forward(lagged[:size_q], n_in, h1, h2, 1, after, a1, a2, lag[0])
+            _forward(lagged[size_q:], n_in, h1, h2, 1, after, a1, a2, lag[1])
+            for i in range(batch):
+                next_value[i] = min(lag[0, i, 0], lag[1, i, 0]) - surprise2[i] / beta
+        mean_next = 0.0
+        for i in range(batch):
+            if episodic and ended[chosen[i]]:
+                next_value[i] = 0.0
+            mean_next += next_value[i] / batch
+        # What the actor proposes is worth.
+        for c in range(2):
+            _forward(weights[c * size_q : (c + 1) * size_q], n_in, h1, h2, 1, proposed, e1[c], e2[c], both[c])
+        mean_worth = 0.0
+        for i in range(batch):
+            worth[i] = min(both[0, i, 0], both[1, i, 0]) - surprise[i] / beta
+            mean_worth += worth[i] / batch
+        if separate and not episodic:
+            numbers[G] += g_rate * (mean_worth - numbers[G])
+        g = numbers[G]
+        loss, theta, residual = 0.0, 0.0, 0.0
+        # The actor: up the lesser Q, whose slope by the action goes through tanh.
+        error_actor[:] = f(0.0)
+        for c in range(2):
+            for i in range(batch):
+                least = both[0, i, 0] <= both[1, i, 0]
+                error[i, 0] = f(1.0) if least == (c == 0) else f(0.0)
+            own = weights[c * size_q : (c + 1) * size_q]
+            w1 = own[: n_in * h1].reshape(n_in, h1)
+            _backward(own, n_in, h1, h2, 1, proposed, e1[c], e2[c], error, d1, d2, slope[c * size_q : (c + 1) * size_q])
+            np.dot(d1, w1.T, into)
+            for i in range(batch):
+                for j in range(k):
+                    error_actor[i, j] += into[i, d + j]
+        for i in range(batch):
+            for j in range(k):
+                t = drawn[i, j]
+                by_before = 2.0 * t / beta - error_actor[i, j] * (1.0 - t * t)
+                shape = math.tanh(out[i, k + j])
+                sd = math.exp(-5.0 + 3.5 * (shape + 1.0))
+                by_log_sd = by_before * noise[i, j] * sd - 1.0 / beta
+                error_actor[i, j] = by_before / batch
+                error_actor[i, k + j] = by_log_sd * 3.5 * (1.0 - shape * shape) / batch
+        _backward(actor, d, h1, h2, 2 * k, x, p1, p2, error_actor, d1, d2, slope[at_actor:])
+        # Q and V.
+        for c in range(2):
+            own = weights[c * size_q : (c + 1) * size_q]
+            _forward(own, n_in, h1, h2, 1, pair, a1, a2, q)
+            for i in range(batch):
+                target = reward[chosen[i]] + next_value[i] - (0.0 if separate else g)
+                off = target - q[i, 0]
+                error[i, 0] = -off / batch
+                loss += 0.5 * off * off / batch
+                if c == 0 and not separate:
+                    theta -= (off + g) / batch
+                    residual += abs(off) / batch
+            _backward(own, n_in, h1, h2, 1, pair, a1, a2, error, d1, d2, slope[c * size_q : (c + 1) * size_q])
+        if separate:
+            _forward(weights[at_v:at_actor], d, h1, h2, 1, x, c1, c2, value)
+            for i in range(batch):
+                h = worth[i] - g
+                error[i, 0] = (value[i, 0] - h) / batch
+                loss += 0.5 * (value[i, 0] - h) ** 2 / batch
+                theta -= (worth[i] - value[i, 0]) / batch
+                residual += abs(worth[i] - value[i, 0] - g) / batch
+            _backward(weights[at_v:at_actor], d, h1, h2, 1, x, c1, c2, error, d1, d2, slope[at_v:at_actor])
+        elif not episodic:
+            numbers[G] += g_rate * (mean_next - numbers[G])
+        numbers[UPDATES] += 1.0
+        t = numbers[UPDATES]
+        rate = (lr + (lr_end - lr) * min(1.0, (t - 1.0) / n_total)) / (1.0 - 0.9**t)
+        _adam(weights, slope, m, v, np.float32(rate), np.float32(math.sqrt(1.0 - 0.999**t)))
+        first = at_v if separate else 0
+        for i in range(lagged.size):
+            lagged[i] += np.float32(tau) * (weights[first + i] - lagged[i])
+        numbers[THETA_SUM] += theta
+        numbers[RESIDUAL_SUM] += residual
+        numbers[LOSS_SUM] += loss
+        numbers[SUMMED] += 1.0

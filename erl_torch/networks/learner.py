@@ -23,7 +23,7 @@ from erl_torch.learners.learner import NonFiniteError
 from erl_torch.networks import autograd, kernels
 from erl_torch.networks.layout import Layout, mlp
 from erl_torch.networks.live import Exploration, Live, Walk
-from erl_torch.networks.policy import NetworkPolicy
+from erl_torch.networks.policy import ActorPolicy, NetworkPolicy
 from erl_torch.networks.problem import BoxProblem
 from erl_torch.networks.replay import COLUMNS, Replay, Steps
 from erl_torch.solution import Status
@@ -188,10 +188,13 @@ class NetworkLearner:
         """In the units of the networks."""
         return self.beta / self.reward_scale
 
-    def policy(self, problem: BoxProblem, state: NetworkState) -> NetworkPolicy:
+    def policy(self, problem: BoxProblem, state: NetworkState) -> NetworkPolicy | ActorPolicy:
         """What ``state`` has learnt."""
+        return self._policy(problem, state.weights)
+
+    def _policy(self, problem: BoxProblem, weights: torch.Tensor) -> NetworkPolicy:
         q, _ = self.layouts(problem)
-        return NetworkPolicy(q, state.weights[: q.size], self.scaled_beta)
+        return NetworkPolicy(q, weights[: q.size], self.scaled_beta)
 
     @property
     def compiled(self) -> bool:
@@ -207,28 +210,34 @@ class NetworkLearner:
     def check(self, problem: BoxProblem) -> None:
         """Raise InputError for a problem that it cannot learn."""
         if not problem.n_actions:
-            allowed = "one for continuous actions, or an environment with Discrete actions (env.actions=5 makes five)"
+            allowed = "deep_s1 or asac, for actions in a box (in Python ActorCriticS1 or AverageActorCritic)"
             raise InputError("learner", type(self).__name__, allowed)
+
+    def _start(self, problem: BoxProblem, rng: np.random.Generator) -> tuple[np.ndarray, slice]:
+        """(weights, which of them the lagged copy is of)."""
+        q, v = self.layouts(problem)
+        own = q.start(rng, zero_output=self.separate)
+        if v is None:
+            return own, slice(0, q.size)
+        return np.concatenate([own, v.start(rng, zero_output=True)]), slice(q.size, None)
 
     def init(
         self, problem: BoxProblem, seed: int, replay: Replay | None = None, walk: Walk | None = None
     ) -> NetworkState:
         """The state of ``seed`` before the first update."""
         self.check(problem)
-        q, v = self.layouts(problem)
         rng, draws = (np.random.default_rng(one) for one in np.random.SeedSequence([seed, 1]).spawn(2))
-        own = q.start(rng, zero_output=self.separate)
-        value = np.zeros(0, np.float32) if v is None else v.start(rng, zero_output=True)
-        weights = torch.from_numpy(np.concatenate([own, value]))
-        lagged = weights[q.size :].clone() if self.separate else weights[: q.size].clone()
+        start, copied = self._start(problem, rng)
+        weights = torch.from_numpy(start)
         random = np.array([int(draws.integers(2**63))], np.uint64).view(np.int64)
         figures = dict.fromkeys(self.names(replay is None), math.nan)
         if replay is None:
-            replay = Replay.empty(problem.n_observation, 0, self.replay_size or self.n_steps)
+            replay = Replay.empty(problem.n_observation, len(problem.low), self.replay_size or self.n_steps)
         zero = torch.zeros_like(weights)
         return NetworkState(
-            weights, lagged, zero, zero.clone(), np.zeros(kernels.N_NUMBERS), random, replay, walk, figures
-        )
+            weights, weights[copied].clone(), zero, zero.clone(), np.zeros(kernels.N_NUMBERS), random, replay, walk,
+            figures,
+        )  # fmt: skip
 
     def names(self, live: bool) -> tuple[str, ...]:
         """Of its ``metrics()``; ``live``: of an environment that it steps."""
@@ -249,19 +258,17 @@ class NetworkLearner:
         weights, lagged, m, v = (x.clone() for x in (state.weights, state.lagged, state.m, state.v))
         numbers, random = state.numbers.copy(), state.random.copy()
         numbers[kernels.THETA_SUM :] = 0.0
-        log_prior = np.full(problem.n_actions, -math.log(problem.n_actions))
         walk, replay = state.walk, state.replay
         if live is None:
-            self._updates(problem, replay, weights, lagged, m, v, numbers, random, log_prior, self.n_steps)(replay.n, n)
+            self._updates(problem, replay, weights, lagged, m, v, numbers, random, self.n_steps)(replay.n, n)
         else:
             assert walk is not None
             replay = replay.with_room(n)
-            learn = self._updates(
-                problem, replay, weights, lagged, m, v, numbers, random, log_prior, self.n_steps * self.updates_per_step
-            )
+            n_total = self.n_steps * self.updates_per_step
+            learn = self._updates(problem, replay, weights, lagged, m, v, numbers, random, n_total)
             schedule = Exploration(self.explore_start, self.explore_end, self.explore_fraction, self.explore_hold)
             walk, replay = live.collect(
-                walk, replay, n, self.n_steps, schedule, self._chooser(problem, weights, log_prior),
+                walk, replay, n, self.n_steps, schedule, self._chooser(problem, weights),
                 lambda stored: learn(stored, self.updates_per_step) if stored >= self.batch else None,
                 self.reward_scale, problem.time_limit if self.train_time_limit is None else self.train_time_limit,
             )  # fmt: skip
@@ -272,9 +279,10 @@ class NetworkLearner:
 
     def _updates(
         self, problem: BoxProblem, replay: Replay, weights: torch.Tensor, lagged: torch.Tensor, m: torch.Tensor,
-        v: torch.Tensor, numbers: np.ndarray, random: np.ndarray, log_prior: np.ndarray, n_total: int,
+        v: torch.Tensor, numbers: np.ndarray, random: np.ndarray, n_total: int,
     ) -> Any:  # fmt: skip
         """(tuples stored, updates) -> None, in place."""
+        log_prior = _log_prior(problem)
         beta = float(self.scaled_beta)
         kappa = float(self.optimism * beta)
         penalty = float(self.support_penalty * self.reward_scale)
@@ -306,20 +314,17 @@ class NetworkLearner:
 
         return plain
 
-    def _chooser(self, problem: BoxProblem, weights: torch.Tensor, log_prior: np.ndarray) -> Any:
-        """(observation [1, d], uniform number) -> action, of the weights as they are when it is called."""
+    def _chooser(self, problem: BoxProblem, weights: torch.Tensor) -> Any:
+        """(observation [1, d], uniform numbers) -> action, of the weights as they are when it is called."""
         q, _ = self.layouts(problem)
         if self.compiled:
             vector = weights.numpy()[: q.size]
             h1, h2 = self.hidden
             beta = float(self.scaled_beta)
-            return lambda observation, uniform: kernels.act(vector, h1, h2, log_prior, beta, observation, uniform)
-
-        def choose(observation: np.ndarray, uniform: float) -> int:
-            p = NetworkPolicy(q, weights[: q.size], self.scaled_beta)(observation)[0]
-            return min(int(np.searchsorted(np.cumsum(p), uniform, side="right")), len(p) - 1)
-
-        return choose
+            log_prior = _log_prior(problem)
+            return lambda observation, uniform: kernels.act(vector, h1, h2, log_prior, beta, observation, uniform[0])
+        policy = self._policy(problem, weights)
+        return lambda observation, uniform: policy.draw(observation, uniform[None])[0][0]
 
     def _figures(self, problem: BoxProblem, state: NetworkState, n: int) -> dict[str, float]:
         """What is logged of ``state``, whose last epoch had ``n`` steps."""
@@ -331,24 +336,15 @@ class NetworkLearner:
 
         replay = state.replay
         recent = np.arange(replay.at - min(n, replay.n), replay.at) % len(replay.reward)
-        rows = torch.from_numpy(replay.observation[recent])
-        policy = self.policy(problem, state)
-        q = policy.layout.output(policy.weights, rows)
-        p = policy(replay.observation[recent])
-        with np.errstate(divide="ignore", invalid="ignore"):
-            kl = np.where(p > 0, p * np.log(p * problem.n_actions), 0.0).sum(1).mean()
+        kl, residual = self._told(problem, state.weights, replay.observation[recent])
         found = {
             "theta": mean(kernels.THETA_SUM) / scale,
             "g": float(numbers[kernels.G]) / scale,
             "loss": mean(kernels.LOSS_SUM) / scale**2,
-            "kl": float(kl),
+            "kl": float(kl.mean()),
         }
-        _, v_layout = self.layouts(problem)
-        if v_layout is not None:
-            soft = torch.logsumexp(policy.beta * q.double(), 1) - math.log(problem.n_actions)
-            value = v_layout.output(state.weights[policy.layout.size :], rows)[:, 0]
-            residual = soft / policy.beta - value.double()
-            low, high = np.quantile(residual.numpy() / scale, [0.05, 0.95])
+        if residual is not None:
+            low, high = np.quantile(residual / scale, [0.05, 0.95])
             found |= {"residual_lower": float(low), "residual_upper": float(high)}
         if state.walk is not None:
             schedule = Exploration(self.explore_start, self.explore_end, self.explore_fraction, self.explore_hold)
@@ -356,6 +352,20 @@ class NetworkLearner:
             found["exploration"] = schedule.share(state.walk.n_steps, self.n_steps)
             found["episode_return"] = float(np.mean(returns)) if returns else math.nan
         return found
+
+    def _told(
+        self, problem: BoxProblem, weights: torch.Tensor, observation: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray | None]:
+        """(KL to the prior, soft Q - V or None without a network of V), [N], at observations [N, d]."""
+        policy, (_, v_layout) = self._policy(problem, weights), self.layouts(problem)
+        kl = policy.draw(observation, np.zeros((len(observation), 1)))[1]
+        if v_layout is None:
+            return kl, None
+        soft = torch.logsumexp(policy.beta * policy.action_values(observation).double(), 1) - math.log(
+            problem.n_actions
+        )
+        value = v_layout.output(weights[policy.layout.size :], torch.from_numpy(observation))[:, 0]
+        return kl, (soft / policy.beta - value.double()).numpy()
 
     # -- the contract ---------------------------------------------------------------------------------
 
@@ -430,3 +440,7 @@ def solution_of(
     status = Status.NON_FINITE if lost else Status.COMPLETED if n >= learner.n_steps else Status.STOPPED
     said = "" if failure is None else str(failure) if lost else f"{type(failure).__name__}: {failure}"
     return NetworkSolution(status, said, np.array([one.theta for one in states]), states, n)
+
+
+def _log_prior(problem: BoxProblem) -> np.ndarray:
+    return np.full(problem.n_actions, -math.log(problem.n_actions))

@@ -147,7 +147,7 @@ class Live:
             n: steps, >= 1.
             n_total: steps of the whole run.
             exploration: its schedule.
-            choose: (observation [1, d], uniform number) -> action of the policy.
+            choose: (observation [1, d], uniform numbers [max(1, k)]) -> action of the policy.
             learn: called after each step with the number of tuples.
             scale: of rewards where they are stored.
             time_limit: steps of an episode at most; None is none.
@@ -165,7 +165,7 @@ class Live:
         taken = list(walk.actions)
         held, episode, total = walk.held, walk.episode, walk.episode_return
         action: Any = walk.action
-        returns = []
+        returns, width = [], max(1, len(problem.low))
         limit = time_limit or 0
         low, high = np.array(problem.low, np.float32), np.array(problem.high, np.float32)
         for step in range(walk.n_steps, walk.n_steps + n):
@@ -176,7 +176,7 @@ class Live:
                 action = rng.uniform(low, high).astype(np.float32) if problem.low else rng.integers(problem.n_actions)
                 chosen, held = action, int(rng.geometric(1.0 / exploration.hold)) - 1
             else:
-                chosen = choose(now, rng.random())
+                chosen = choose(now, rng.random(width))
             observation, reward, terminated, truncated = self._step(chosen)
             taken.append(chosen)
             total += reward

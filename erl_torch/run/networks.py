@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,10 +18,11 @@ from erl_torch.files import write_npz, write_png
 from erl_torch.learners.learner import NonFiniteError
 from erl_torch.log.quantities import results, tagged, with_own
 from erl_torch.log.tensorboard import Board, Boards, layout, replica_layout
+from erl_torch.networks.actor_critic import suited
 from erl_torch.networks.episodes import Stage
 from erl_torch.networks.learner import NetworkLearner, NetworkSolution, NetworkState
 from erl_torch.networks.live import Live
-from erl_torch.networks.policy import uniform
+from erl_torch.networks.policy import Acting, NetworkPolicy, Prior
 from erl_torch.networks.problem import BoxProblem, Truth, spaces
 from erl_torch.networks.quantities import NETWORK_QUANTITIES
 from erl_torch.networks.seeds import Seeds, SeedsState
@@ -111,7 +112,7 @@ class NetworkRecorder:
     def shape(self) -> tuple[int, ...]:
         return (len(self.seeds),) if self.many else ()
 
-    def _measure(self, policies: Sequence[Callable[[np.ndarray], np.ndarray]]) -> dict[str, np.ndarray]:
+    def _measure(self, policies: Sequence[Acting]) -> dict[str, np.ndarray]:
         """Figures [K] of the policies of all seeds."""
         rows = []
         for policy in policies:
@@ -120,6 +121,7 @@ class NetworkRecorder:
             real = rate - sampled.kl / self.learner.beta
             row = {"reward_per_step": rate, "objective" if not self.learner.optimism else "objective_real": real}
             if self.truth is not None:
+                assert isinstance(policy, (NetworkPolicy, Prior))
                 row |= self.truth.figures(policy)
             row |= {"return": sampled.returns.mean(), "return_greedy": greedy.returns.mean()}
             rows.append(row)
@@ -128,7 +130,8 @@ class NetworkRecorder:
     # -- records --------------------------------------------------------------------------------------
 
     def begin(self) -> None:
-        self.first = self.last = self._measure([uniform(self.problem.n_actions)] * len(self.seeds))
+        prior = Prior(self.problem.n_actions, self.problem.low, self.problem.high)
+        self.first = self.last = self._measure([prior] * len(self.seeds))
 
     def _one(self, measured: Mapping[str, np.ndarray]) -> dict[str, float]:
         return {name: float(values[0]) for name, values in measured.items() if np.isfinite(values[0])}
@@ -209,7 +212,7 @@ class NetworkRecorder:
         """What a reader of the figures should know."""
         each, found = _each(outcome.state), []
         kl = max(one.figures["kl"] for one in each)
-        most = float(np.log(self.problem.n_actions))
+        most = float(np.log(self.problem.n_actions or np.inf))
         if kl > most - SATURATED:
             found.append(
                 f"the policy is nearly deterministic (KL to the prior {kl:.3g} of at most {most:.3g} nats a step); a "
@@ -316,6 +319,7 @@ def network_parts(
         )
     problem = make_network_problem(cfg)
     learner: NetworkLearner = made(cfg.learner, resolve(cfg.learner["class"], "learner.class"), "learner")
+    learner = suited(learner, problem)
     learner.check(problem)
     truth = None
     kind = TRUTHS.get(str(cfg.env.get("id")))

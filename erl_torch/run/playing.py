@@ -115,7 +115,8 @@ def _of_network(cfg: DictConfig, settings: DictConfig, run: Path) -> tuple[Playe
     elif cfg.replica is not None:
         raise InputError("replica", cfg.replica, f"left out: {run} holds one policy")
     policy, problem = load_policy(run / name), make_network_problem(settings)
-    if (problem.n_observation, problem.n_actions) != (policy.layout.widths[0], policy.layout.widths[-1]):
+    outputs = problem.n_actions or 2 * len(problem.low)
+    if (problem.n_observation, outputs) != (policy.layout.widths[0], policy.layout.widths[-1]):
         raise InputError("run", run, "one whose policy fits its environment")
     mode = MODES.get(cfg.render)
     with contextlib.closing(raw_env(settings.env)) as plain:
@@ -135,9 +136,13 @@ def _of_network(cfg: DictConfig, settings: DictConfig, run: Path) -> tuple[Playe
                 shown.append(env.render() if drawn else str(observation))
             over = False
             while not over and lengths[i] < horizon:
-                p = policy(np.asarray(observation, np.float32).reshape(1, -1))[0]
-                a = int(p.argmax() if cfg.greedy else rng.choice(len(p), p=p))
-                observation, reward, terminated, truncated, _ = env.step(a + problem.first_action)
+                now, uniform = (
+                    np.asarray(observation, np.float32).reshape(1, -1),
+                    rng.random((1, max(1, len(problem.low)))),
+                )
+                a = (policy.best(now) if cfg.greedy else policy.draw(now, uniform)[0])[0]
+                taken = a if problem.low else int(a) + problem.first_action
+                observation, reward, terminated, truncated, _ = env.step(taken)
                 returns[i] += float(reward)
                 lengths[i] += 1
                 ended[i], over = terminated, terminated or truncated
