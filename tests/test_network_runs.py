@@ -184,7 +184,6 @@ def test_play_of_a_network(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("overrides", "said"),
     [
-        (["env=pendulum_v1"], "learner=DeepS1: must be one for continuous actions"),
         (["env=windy_cliff"], "env=windy_cliff: must be one with observations in a Box"),
         (["env=windy_strip", "experience=recorded", "experience.path=x.csv"], "experience=recorded: must be simulate"),
         (["env=windy_strip", "+vary.beta=[1,2]"], "vary="),
@@ -198,6 +197,11 @@ def test_bad_keys_are_named(tmp_path, overrides, said):
     with pytest.raises(InputError, match=said):
         train(composed("learner=deep_s1", *overrides), tmp_path)
     assert not list(tmp_path.iterdir())
+
+
+def test_learners_of_few_actions_point_at_those_of_boxes(tmp_path):
+    with pytest.raises(InputError, match="learner=AverageSoftQ: must be deep_s1 or asac"):
+        train(composed("env=pendulum_v1", "learner=asql"), tmp_path)
 
 
 def test_learners_of_tables_point_at_networks(tmp_path):
