@@ -9,7 +9,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from erl_torch.log.quantities import PREFIXES, QUANTITIES
+from erl_torch.log.quantities import PREFIXES, QUANTITIES, Quantity
+from erl_torch.networks.quantities import NETWORK_QUANTITIES
 
 PAGE = Path(__file__).parents[1] / "logging.md"
 
@@ -25,13 +26,17 @@ def _code(names: Iterable[str]) -> str:
 
 def tables() -> dict[str, str]:
     """Each table by the name in its comment."""
-    rows = []
-    for q in QUANTITIES:
-        tags = [*q.tags, *([f"GROUP/{q.name}"] if q.replicas else [])]
-        rows.append((_code(tags), q.unit, f"`{q.result}`" if q.result else "", q.meaning))
+
+    def rows(quantities: Iterable[Quantity]) -> Iterable[Sequence[str]]:
+        for q in quantities:
+            tags = [*q.tags, *([f"GROUP/{q.name}"] if q.replicas else [])]
+            yield _code(tags), q.unit, f"`{q.result}`" if q.result else "", q.meaning
+
+    head = ("tags", "unit", "in `result.json`", "what it is")
     return {
         "prefixes": _table(("tags", "what they are"), [(f"`{k}/...`", text) for k, text in PREFIXES.items()]),
-        "quantities": _table(("tags", "unit", "in `result.json`", "what it is"), rows),
+        "quantities": _table(head, rows(QUANTITIES)),
+        "networks": _table(head, rows(NETWORK_QUANTITIES)),
     }
 
 

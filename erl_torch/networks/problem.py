@@ -20,8 +20,11 @@ class Truth(Protocol):
     optimum: dict[str, float]
 
     def figures(self, probabilities: Callable[[np.ndarray], np.ndarray]) -> dict[str, float]:
-        """By name: "objective", "gap", "kl", "theta" (of the optimum) and others, of the policy that gives the
+        """By name: "objective", "loss_of_policy", "kl_to_optimal" and others, of the policy that gives the
         ``probabilities`` [N, A] at observations [N, d]."""
+
+    def picture(self, policy: Any) -> np.ndarray:  # a NetworkPolicy, which is defined above
+        """Of the policy beside the best one, [H, W, 3] uint8."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +40,6 @@ class BoxProblem:
         time_limit: steps of an episode at most; None is none.
         end_reward: added to the reward of a step that terminates an episode: a charge < 0, or a bonus > 0.
         name: what messages and pictures call it.
-        truth: judges policies exactly; None where nothing does.
     """
 
     make: Callable[[], Environment]
@@ -49,7 +51,6 @@ class BoxProblem:
     time_limit: int | None = None
     end_reward: float = 0.0
     name: str = "the environment"
-    truth: Truth | None = None
 
 
 def spaces(env: Environment, name: str) -> tuple[int, int, int, tuple[float, ...], tuple[float, ...]]:

@@ -7,6 +7,8 @@ from collections.abc import Callable
 import numpy as np
 
 from erl_torch.envs.windy_strip import MOVES, strip_mdp
+from erl_torch.networks.policy import Acting, NetworkPolicy
+from erl_torch.networks.strip_pictures import OnGrid, paths_picture
 from erl_torch.solvers.chains import long_run, policy_chain
 from erl_torch.solvers.policy import objective
 from erl_torch.solvers.soft_bellman import solve_soft_bellman
@@ -53,6 +55,11 @@ class StripTruth:
         if self.optimism:
             found["objective_real"] = objective(self.strip.mdp, policy, self.prior, self.beta)
         return found
+
+    def picture(self, policy: NetworkPolicy) -> np.ndarray:
+        """Paths of the policy and of the optimum in the same wind, [H, W, 3] uint8."""
+        shown: dict[str, Acting] = {"learnt": policy, "optimal": OnGrid(self.solution.policy.numpy())}
+        return paths_picture(shown, {"learnt": self.figures(policy), "optimal": self.optimum})
 
 
 TRUTHS = {"erl_torch/WindyStrip-v0": StripTruth}

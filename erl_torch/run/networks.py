@@ -161,6 +161,8 @@ class NetworkRecorder:
         each = _each(state)
         self.last = self._measure([self.learner.policy(self.problem, one) for one in each])
         step = self.learner.position(each[0])
+        if milestone and self.truth is not None and self.settings.pictures:
+            board.picture("paths", self.truth.picture(self.learner.policy(self.problem, each[0])), step)
         if self.many:
             self.recorded.add(step, {**row, **self.last}, board)
         else:
