@@ -1,5 +1,7 @@
 """Empirical models and certainty equivalence, against brute force and the exact solver."""
 
+import re
+
 import hypothesis
 import numpy as np
 import oracle
@@ -207,3 +209,13 @@ def test_an_answer_that_is_not_solved_says_what_is_proven():
     low, high = (float(x) for x in found.message.split("in the data, theta* in [")[1].rstrip("]").split(", "))
     assert low <= -best <= high
     assert high - low > 1e-3
+
+
+def test_data_whose_closed_set_has_no_single_rate():
+    """States 0 and 1 keep apart below optimism 0, and state 2 is left for ever: no theta, bounds in words."""
+    s, a = [2, 2, 0, 0, 1, 1, 1, 1], [0, 1, 0, 1, 0, 0, 1, 1]
+    r, after = [0.0, 0, 1, 1, 0, 0, 0, 0], [0, 0, 0, 1, 0, 1, 0, 1]
+    found = CertaintyEquivalence(beta=10.0, optimism=-1.0).fit(Transitions(s, a, r, after, a), 3, 2)
+    assert found.status is Status.NO_SINGLE_RATE
+    assert found.theta is None
+    assert re.search(r"-?\d", found.message)

@@ -480,3 +480,11 @@ def test_a_preset_says_which_learner_it_wants(tmp_path):
         short = ("learner.n_epochs=1", "learner.n_bias=1") if learner == "s1" else ()
         result = train(composed("env=cart_pole_v1", f"learner={learner}", *few, *short), tmp_path / learner)
         assert any(wanted in text for text in result["notes"]) == says
+
+
+def test_an_end_reward_that_no_end_got_is_noted(tmp_path):
+    """Learnt from steps, a charge of states in which nothing ends does nothing: a run says so."""
+    few = ("env=cart_pole_v1", *FEW, "learner=certainty_equivalence")
+    told = [train(composed(*few, f"env.failures={rule}"), tmp_path / rule)["notes"] for rule in ("[14]", "all")]
+    assert any("no end of the stream got env.end_reward" in text for text in told[0])
+    assert not any("no end of the stream" in text for text in told[1])

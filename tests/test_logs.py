@@ -1149,3 +1149,31 @@ def test_a_row_that_cannot_be_split_hides_no_step(tmp_path):
     log = read_log(whole, on_bad="skip")
     assert (log.report.tuples, log.report.bad) == (2, 1)
     assert "1 bad row (the first is a line that is no row)" in str(log.report)
+
+
+# -- missing cells of a column of episodes ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("gone", ["", "NA", "nan"])
+@pytest.mark.parametrize("header", ["s,a,r,episode", "s,a,r,episode,step"])
+def test_a_row_whose_episode_is_missing_is_named_as_in_other_formats(tmp_path, gone, header):
+    """Rows far apart were put together as an episode more, so that states led to others that never followed."""
+    episodes = ["1", gone, "1", "2", gone, "2", "2"]
+    steps = [0, 1, 2, 0, 1, 2, 3]
+    rows = [f"{s},go,1,{episode}" for s, episode in zip("abcdefg", episodes, strict=True)]
+    if header.endswith("step"):
+        rows = [f"{row},{step}" for row, step in zip(rows, steps, strict=True)]
+    (tmp_path / "log.csv").write_text("\n".join([header, *rows]))
+    with pytest.raises(InputError, match=r"episode\[1\].*must be there"):
+        read_log(tmp_path / "log.csv")
+    log = read_log(tmp_path / "log.csv", on_bad="skip")
+    texts = log.problem.state_labels.texts
+    led = {(str(texts[s]), str(texts[t])) for s, t in zip(log.experience.s, log.experience.s_next, strict=True)}
+    assert led <= {("a", "c"), ("f", "g"), ("d", "f")} - ({("a", "c"), ("d", "f")} if "step" in header else set())
+    assert log.report.bad == 2
+
+
+def test_names_of_episodes_may_be_words_that_stand_for_nothing(tmp_path):
+    """Among words "none" is a name."""
+    (tmp_path / "log.csv").write_text("s,a,r,episode\n0,0,1,none\n1,0,1,none\n0,1,1,all\n1,1,1,all\n")
+    assert read_log(tmp_path / "log.csv").report.episodes == 2

@@ -654,3 +654,18 @@ def test_a_missing_action_is_as_if_another_had_its_prior():
             assert not found.policy.numpy()[..., missing].any()
             assert np.isneginf(found.action_value.numpy()[..., :3, :][..., missing[:3]]).all()
             assert found.gap < 1e-10
+
+
+def test_figures_between_infinite_bounds_are_no_numbers():
+    """40 states uphill, up by .05: about 1e50 steps to the end; the value was a number outside its bounds."""
+    n, up = 40, 0.05
+    p = np.zeros((n + 1, 1, n + 1))
+    for s in range(n):
+        p[s, 0, s + 1] += up
+        p[s, 0, max(s - 1, 0)] += 1 - up
+    p[n, 0, n] = 1
+    mdp = TabularMDP(p, np.where(np.arange(n + 1) < n, -1.0, 0.0)[:, None], np.eye(n + 1)[0])
+    found = evaluate_episodes(mdp, np.ones((n + 1, 1)), np.arange(n + 1) == n)
+    for figure in (found.mean_return, found.steps):
+        assert np.isnan(figure.value) or figure.low <= figure.value <= figure.high
+        assert np.isnan(figure.value) or np.isfinite([figure.low, figure.high]).all()

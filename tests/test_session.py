@@ -1035,3 +1035,47 @@ def test_a_replica_whose_theta_is_lost_has_failed(tmp_path, tuples):
         with pytest.raises(NonFiniteError, match="theta is nan"):
             erl_torch.train(learner, MDP, tuples, directory=tmp_path / name, evaluation=QUICK)
     assert np.isfinite(np.load(tmp_path / "many/replicas.npz")["theta"]).all()
+
+
+@dataclass(frozen=True)
+class Losing(Counts):
+    """Its policy is lost in the second of three passes; theta stays a number."""
+
+    def step(self, state, stream):
+        after = super().step(state, stream)
+        return dataclasses.replace(after, policy=after.policy * float("nan")) if after.epoch == 2 else after
+
+
+@pytest.mark.parametrize("every", [1, 2, 1000])
+def test_a_policy_lost_between_records_is_not_kept(tmp_path, tuples, every):
+    """The last good tables and the cause are kept, however rarely policies are measured."""
+    settings = dataclasses.replace(QUICK, every=every)
+    for _ in range(2):
+        with pytest.raises(NonFiniteError, match="the policy has probabilities that are no numbers"):
+            erl_torch.train(Losing(), MDP, tuples, directory=tmp_path, evaluation=settings)
+    result = json.loads((tmp_path / "result.json").read_text())
+    assert result["status"] == "non_finite"
+    assert "no numbers" in result["message"]
+    assert result["n_tuples"] == len(tuples)
+    assert np.isfinite(np.load(tmp_path / "solution.npz")["policy"]).all()
+
+
+def test_fit_looks_at_its_numbers_too(tuples):
+    found = Losing().fit(tuples, MDP.n_states, MDP.n_actions)
+    assert found.status is Status.NON_FINITE
+    assert torch.isfinite(found.policy).all()
+
+
+def test_lost_replicas_have_no_figures(tmp_path, tuples):
+    """Lost in their first pass, before any record: the figures of the prior are none of theirs."""
+
+    class Lost(AlgorithmS1):
+        def step(self, state, stream):
+            return dataclasses.replace(super().step(state, stream), rho=float("nan"))
+
+    with pytest.raises(NonFiniteError):
+        erl_torch.train(Replicas.of(Lost(), 2), MDP, tuples, directory=tmp_path, evaluation=QUICK)
+    result = json.loads((tmp_path / "result.json").read_text())
+    assert result["groups"][0]["replicas"] == 0
+    assert result["objective"] is None
+    assert result["data_half_widths"] is None

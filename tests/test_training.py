@@ -468,7 +468,7 @@ def test_exact_return_of_an_episode(tmp_path):
         ("env=FrozenLake-v1", ["env=frozen_lake"]),
         ("env=erl_torch/WindyCliff-v0", ["env=windy_cliff"]),
         ("env=CartPole-v1", ["env=cart_pole_v1"]),
-        ("env=Acrobot-v1", ["env=gym", "env.id=Acrobot-v1"]),
+        ("env=Blackjack-v1", ["env=gym", "env.id=Blackjack-v1"]),
         ("env=my_package:My/World-v3", ["env=gym", "env.id=my_package:My/World-v3"]),
         ("env=windy_cliff", ["env=windy_cliff"]),
         ("seed=1", ["seed=1"]),

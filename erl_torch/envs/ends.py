@@ -17,7 +17,7 @@ class EndReward(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs
     """Adds ``end_reward`` to the reward of a step that terminates an episode (``erl_torch.mdp.ends``).
 
     A charge, < 0, is added where the end is a failure, a bonus, > 0, where it is none. ``info["failure"]`` of an ending
-    step says which it was. Truncated episodes have not ended.
+    step says which it was. Truncated episodes have not ended. ``n_paid`` counts the ends that got it.
 
     Args:
         env: with finite spaces; they are Discrete then.
@@ -34,6 +34,7 @@ class EndReward(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs
         super().__init__(env := encoded(env))
         rule = rule_of_ends(failures, env)
         self.rule = EndRule(rule, checks.finite("end_reward", end_reward))
+        self.n_paid = 0
         if end_pays(env) is not None:  # then the environment tells of all its ends
             ends = model_ends(env, failures)
             with_end_reward(0.0 * ends.ended, ends.ended, ends.failed, end_reward)
@@ -46,6 +47,7 @@ class EndReward(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs
         observation, reward, terminated, truncated, info = self.env.step(action)
         if terminated:
             failed, more = self.rule.of(float(reward), int(observation))
+            self.n_paid += more != 0
             info = {**info, "failure": failed}
             reward = float(reward) + more
         return observation, float(reward), terminated, truncated, info

@@ -460,5 +460,6 @@ def _report(
 
 
 def _texts(encoding: Encoding) -> Callable[[int], str]:
+    """The number of a state or an action as text, on one line."""
     labels: Labels | None = encoding.labels
-    return str if labels is None else labels.text
+    return str if labels is None else lambda number: " ".join(labels.text(number).splitlines())

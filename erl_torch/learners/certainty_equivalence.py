@@ -150,9 +150,11 @@ class CertaintyEquivalence(StreamLearner[CertaintyEquivalenceState, CertaintyEqu
             message = "; ".join(filter(None, (part.message, answer.message, proven((lower, upper), None))))
         elif theta is None:  # states are left for ever in the data, where other states may be better
             ending = solve_problem(part.problem.ending(), stream.model, None, self.tol, self.max_steps)
-            theta = ending.theta
-            assert theta is not None
-            message = "; ".join(filter(None, (part.message, answer.message, "theta is that of the closed set")))
+            theta, told = ending.theta, "theta is that of the closed set"
+            if theta is None:  # nor has the closed set a single rate
+                assert ending.theta_bounds is not None
+                status, told = ending.status, proven(ending.theta_bounds, None)
+            message = "; ".join(filter(None, (part.message, answer.message, told)))
         elif answer.status is not Status.CONVERGED:
             message = "; ".join(
                 filter(None, (part.message, answer.message, f"in the data, {proven((lower, upper), None)}"))

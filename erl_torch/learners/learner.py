@@ -241,7 +241,9 @@ class StreamLearner(ABC, Generic[T, Prepared]):
         history: list[Mapping[str, float]] = []
         failure: NonFiniteError | None = None
         try:
-            for state in self.iterate(transitions, n_states, n_actions):
+            for new in self.iterate(transitions, n_states, n_actions):
+                check_numbers(new.n_tuples, new.theta, new.policy)
+                state = new
                 history.append(state.metrics())
         except NonFiniteError as error:
             failure = error

@@ -28,7 +28,7 @@ from erl_torch.experience.experience import EXPERIENCE, Experience
 from erl_torch.experience.log import UNSEEN, Log
 from erl_torch.experience.recording import FileRecording
 from erl_torch.experience.simulation import KEEP_BYTES, TUPLE_BYTES, ReplicaExperience
-from erl_torch.experience.sources import Recorded, Source
+from erl_torch.experience.sources import Recorded, Simulate, Source
 from erl_torch.experience.transitions import Transitions, join
 from erl_torch.files import read_npy
 from erl_torch.learners.learner import CONTRACT, TabularLearner, with_prior
@@ -257,8 +257,8 @@ def _end_reward(
         with _end_target():
             model = tabular_mdp(env, allowed=allowed)
             found = smallest_charge(model, ends.failed, beta, cfg.get("end_target", 1e-3), prior)
-    note(f"end_reward=auto: {-found.charge:.9g}, at which {found.failing_rate:.3g} of the optimum's steps fail")
-    return -found.charge
+    note(f"end_reward=auto: {0.0 - found.charge:.9g}, at which {found.failing_rate:.3g} of the optimum's steps fail")
+    return 0.0 - found.charge
 
 
 @contextlib.contextmanager
@@ -275,8 +275,8 @@ def _counted_charge(free: Experience, charged: Experience, beta: float, target: 
     with _end_target():
         found = charge_of_tuples(free, charged, beta, target, prior)
     rate = f"{found.failing_rate:.3g} of the steps of their optimum fail"
-    note(f"end_reward=auto: {-found.charge:.9g}, by the counts of the tuples alone, at which {rate}")
-    return -found.charge
+    note(f"end_reward=auto: {0.0 - found.charge:.9g}, by the counts of the tuples alone, at which {rate}")
+    return 0.0 - found.charge
 
 
 def _world_of_steps(
@@ -506,6 +506,9 @@ def make_experience(source: Source, problem: Problem, seed: int, safe_point: Saf
     with group("experience"), _collecting(source.work, source.n_tuples, safe_point) as report:
         data = source(problem, seed, report)
         checks.instance("class", data, Experience, f"a source of {EXPERIENCE}")
+    charged = problem.source
+    if isinstance(charged, EndReward) and not charged.n_paid and isinstance(source, Simulate):
+        note(f"no end of the stream got env.end_reward ({charged.rule})")
     return accepted(data)
 
 

@@ -182,6 +182,11 @@ class Record:
                 board.scalars({f"{tag}_{key}": found[key] for key in LOGGED}, step)
                 board.scalars({f"{tag}_{key}": value for key, value in lines.items() if value is not None}, step)
 
+    def lose(self, lost: np.ndarray) -> None:
+        """Of the last records those of the replicas ``lost`` [R] count no longer."""
+        for rows in self.alive.values():
+            rows[-1] = rows[-1] & ~lost
+
     def statistics(self, group: Group) -> dict[str, Any]:
         """Of the last record: statistics by quantity, replicas that count."""
         found: dict[str, Any] = {"replicas": 0}

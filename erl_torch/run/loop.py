@@ -19,7 +19,7 @@ from typing_extensions import TypeVar as Defaulting
 
 from erl_torch.checks import InputError
 from erl_torch.files import write_json
-from erl_torch.learners.learner import Learner, NonFiniteError, State, check_numbers, columns
+from erl_torch.learners.learner import Learner, NonFiniteError, State, columns
 from erl_torch.log.event_file import PATTERN
 from erl_torch.log.tensorboard import Board, Boards, of_sweep
 from erl_torch.notes import note
@@ -67,6 +67,9 @@ class Recorder(Protocol[S, A]):
 
     def open(self, board: Board, goes_on: bool) -> None:
         """The record of the prior policy at step 0, unless the run ``goes_on`` from a checkpoint."""
+
+    def check(self, state: S, row: Row) -> None:
+        """Raise NonFiniteError where ``state`` is no longer of numbers: the one before is then the last good one."""
 
     def record(self, state: S, row: Row, milestone: str, board: Board) -> None:
         """Measure the policy of ``state`` and write; ``row`` is its ``metrics()``."""
@@ -231,8 +234,7 @@ class Run(Generic[S, E, A, P]):
                 states = learner.run(self.problem, self.experience, outcome.state if goes_on else None)
                 for state in _timed(states, outcome):
                     row = _checked(state.metrics(), outcome.history, recorder.shape)
-                    if not recorder.shape:
-                        check_numbers(learner.position(state), row.get("theta"))
+                    recorder.check(state, row)
                     outcome.state = state
                     outcome.history.append(row)
                     milestone = learner.milestone(state)

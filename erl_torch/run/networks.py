@@ -42,7 +42,7 @@ SATURATED = 0.05  # nats below log A, from which on a policy is called nearly de
 FILE = "policy.safetensors"
 
 
-def of_seed(seed: int) -> str:
+def of_seed(seed: int | str) -> str:
     """The file of the policy of one replica."""
     return f"policy-{seed}.safetensors"
 
@@ -156,6 +156,9 @@ class NetworkRecorder:
         board.lines(self._constant())
         if not goes_on:
             board.record(tagged("eval", self._one(self.first)), 0)
+
+    def check(self, state: NetworkState | SeedsState, row: Row) -> None:
+        """The learners look at their weights themselves."""
 
     def record(self, state: NetworkState | SeedsState, row: Row, milestone: str, board: Board) -> None:
         each = _each(state)

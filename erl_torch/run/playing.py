@@ -25,7 +25,7 @@ from erl_torch.networks.policy import load_policy
 from erl_torch.rng import streams
 from erl_torch.run.build import is_log, make_env, raw_env, reads_table
 from erl_torch.run.classes import is_own
-from erl_torch.run.networks import FILE, has_networks, make_network_problem, of_seed
+from erl_torch.run.networks import FILE, make_network_problem, of_seed
 from erl_torch.run.settings import Play, check_keys
 from erl_torch.solution import Solution
 
@@ -64,7 +64,7 @@ def play(cfg: DictConfig) -> Played:
         allowed = f"one with an environment: a log alone has none to play in; its policy is in {run / 'policy.csv'}"
         raise InputError("run", run, allowed)
     mode = MODES.get(cfg.render)
-    if has_networks(settings.learner):
+    if any(run.glob(of_seed("*"))) or (run / FILE).is_file():  # of a network
         played, fps = _of_network(cfg, settings, run)
         return _told(cfg, settings, run, played, fps)
     table = run_policy(run, cfg.replica)

@@ -155,6 +155,9 @@ class ReplicaRecorder:
         if not goes_on:
             self.recorded.add(0, self.first, board)
 
+    def check(self, state: ReplicaState, row: Row) -> None:
+        """Replicas that are lost are told by ``state.failures``; the others go on."""
+
     def record(self, state: ReplicaState, row: Row, milestone: str, board: Board) -> None:
         measured = {**row, **self.judges(state.policy.numpy(), bool(milestone))}
         alive = np.array([r not in state.failures for r in range(len(self.replicas))])
@@ -184,11 +187,14 @@ class ReplicaRecorder:
 
     def finish(self, outcome: Outcome[ReplicaState], solution: ReplicaSolution, board: Board) -> ReplicaSolution:
         step = outcome.state.n_tuples
+        lost = np.isin(np.arange(len(self.replicas)), list(solution.failures))
+        self.recorded.lose(lost)
         if self.judges.plays and self.recorded.steps.get("return", [step])[-1] != step:
             alive = np.array([r not in outcome.state.failures for r in range(len(self.replicas))])
             self.recorded.add(step, self.judges(outcome.state.policy.numpy(), True), board, alive)
         per_setting = " of each setting" if len(self.groups) > 1 else ""
         title = f"{self.title.env}, {self.title.learner}: {plural(self._n_each, 'replica')}{per_setting}"
+        title += f", {lost.sum()} lost" * bool(lost.any())
         drawn = [("bands", self.recorded.curves(), "tuples streamed, each replica", title)]
         key, panels = self.recorded.sweep()
         if key:
@@ -319,8 +325,11 @@ class ReplicaRecorder:
         return statistics(finite) | {"replicas": len(finite)} if finite.size else None
 
     def _away(self, solution: ReplicaSolution) -> list[float]:
-        pairs = zip(solution.solutions, self.data, strict=True)
-        return [reservations.half_widths(one.theta, data.estimate) for one, data in pairs]
+        """Of the replicas that are not lost."""
+        pairs = enumerate(zip(solution.solutions, self.data, strict=True))
+        return [
+            reservations.half_widths(one.theta, data.estimate) for r, (one, data) in pairs if r not in solution.failures
+        ]
 
     def summary(self, result: Mapping[str, Any], directory: Path) -> str:
         name = f"{self.title.env}, {self.title.learner}"

@@ -187,13 +187,16 @@ class SingleRecorder:
             board.record(self._tags(self.start, 0, self.start.metrics()), 0)
             self._draw(self.start, 0, "prior policy", board)
 
+    def check(self, state: TabularState, row: Row) -> None:
+        policy = state.policy if isinstance(state.policy, torch.Tensor) else None  # others are named in ``record``
+        check_numbers(self.learner.position(state), row.get("theta"), policy)
+
     def record(self, state: TabularState, row: Row, milestone: str, board: Board) -> None:
         position = self.learner.position(state)
         policy = state.policy
         if not isinstance(policy, torch.Tensor) or policy.shape != self.problem.prior.shape:
             shape = list(self.problem.prior.shape)
             raise InputError("policy of the learner", type(policy).__name__, f"a torch.Tensor {shape}, in every epoch")
-        check_numbers(position, None, policy)
         self.last = self._measure(policy)
         board.record(self._tags(state, position, row), position)
         if milestone:
@@ -256,7 +259,9 @@ class SingleRecorder:
 
     def finish(self, outcome: Outcome[TabularState], solution: Solution, board: Board) -> Solution:
         stopped, position = outcome.stopped, self.learner.position(outcome.state)
-        if isinstance(stopped, Exception) and not isinstance(stopped, NonFiniteError):
+        if isinstance(stopped, NonFiniteError):
+            solution = replace(solution, message=solution.message or str(stopped))
+        elif isinstance(stopped, Exception):
             solution = replace(solution, message=f"{type(stopped).__name__}: {stopped}")
         if self.optimum is not None:
             assert self.model is not None

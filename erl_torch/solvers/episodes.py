@@ -145,8 +145,9 @@ def _until_the_end(
         x = x[:k]
         if steps is None:  # c = 1: x + least h <= h <= x + most h
             steps = up(up(x / (1 - most))) if most < 0.5 else np.full(k, np.inf)
-            return x, down(down(x / (1 - least))), steps
-        return x, down(down(x + down(least * steps))), up(up(x + up(most * steps)))
+            return np.where(np.isfinite(steps), x, np.nan), down(down(x / (1 - least))), steps
+        known = np.where(np.isfinite(steps), x, np.nan)  # else nothing is known of it
+        return known, down(down(x + down(least * steps))), up(up(x + up(most * steps)))
 
     of_steps = solved(tables[-1], None)
     figures = [*(solved(table, of_steps[2]) for table in tables[:-1]), of_steps]

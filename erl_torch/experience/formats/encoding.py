@@ -15,10 +15,9 @@ from typing import Any
 import numpy as np
 
 from erl_torch.checks import InputError
-from erl_torch.experience.formats.table import Cells
+from erl_torch.experience.formats.table import MISSING, Cells
 from erl_torch.labels import Labels
 
-MISSING = ("na", "n/a", "nan", "null", "none", "#n/a", "<na>", "-")  # in a column of numbers
 NUMBER = re.compile(r"[+-]?((0|[1-9][0-9]*)(\.[0-9]*)?|\.[0-9]+)([eE][+-]?[0-9]+)?")
 TRUE, FALSE = ("true", "t", "yes", "y", "1"), ("false", "f", "no", "n", "0")
 LOST, UNKNOWN = -1, -2  # numbers of a missing value, and of one that is no state (or action)

@@ -32,6 +32,9 @@ BLOCK = 1 << 22  # bytes of CSV at a time
 EXTRA = "parquet"  # what installs pyarrow
 
 
+MISSING = ("na", "n/a", "nan", "null", "none", "#n/a", "<na>", "-")  # in a column of numbers
+
+
 class Cells(NamedTuple):
     """A column, some rows of it: ``values[codes]``, where a code of -1 is a missing value.
 
@@ -46,14 +49,32 @@ class Cells(NamedTuple):
         return len(self.values if self.codes is None else self.codes)
 
     def factors(self) -> tuple[list[Any], np.ndarray]:
-        """(distinct values, codes [n]): numbers too."""
+        """(distinct values, codes [n], -1 where one is missing): numbers too.
+
+        Missing is an empty text, and among numbers what stands for none, ``MISSING``.
+        """
         if self.codes is not None:
-            return self.values, self.codes
+            there = [
+                value for value in self.values if not isinstance(value, str) or value.lower() not in ("", *MISSING)
+            ]
+            if len(there) == len(self.values):
+                return self.values, self.codes
+            numbers = all(map(_is_number, there))
+            gone = [isinstance(v, str) and (not v or (numbers and v.lower() in MISSING)) for v in self.values]
+            return self.values, np.where(np.array([*gone, True])[self.codes], -1, self.codes)
         distinct, codes = np.unique(self.values, return_inverse=True)
         codes = codes.reshape(-1).astype(np.int64)
         if distinct.dtype.kind == "f" and len(distinct) and np.isnan(distinct[-1]):
             return distinct[:-1].tolist(), np.where(codes == len(distinct) - 1, -1, codes)
         return distinct.tolist(), codes
+
+
+def _is_number(value: object) -> bool:
+    try:
+        float(str(value).replace(",", "."))
+    except ValueError:
+        return False
+    return True
 
 
 class Table(Protocol):
