@@ -2,7 +2,7 @@
 
     python benchmarks/networks.py [TASK ...]    writes docs/results/networks.json and docs/results/networks.md
 
-Tasks: strip, cart_pole, acrobot, mountain_car, lander, lander_wind (these two need gymnasium[box2d]). Returns are means
+Tasks: strip, cart_pole, acrobot, mountain_car, pendulum, lander, lander_wind (these two need box2d). Returns are means
 of 100 episodes from starts that are the same for all seeds, by the most probable actions and as drawn. Seconds are of
 the processor, learning alone.
 """
@@ -20,6 +20,7 @@ import torch
 
 from erl_torch import configurations
 from erl_torch.cli.config import composed, register
+from erl_torch.networks.actor_critic import suited
 from erl_torch.networks.episodes import Stage
 from erl_torch.networks.live import Live
 from erl_torch.networks.truth import TRUTHS
@@ -34,9 +35,16 @@ TASKS = {
     "acrobot": ["env=acrobot_v1"],
     "mountain_car": ["env=mountain_car_v0"],
     "lander": ["env=lunar_lander"],
-    "lander_wind": ["env=lunar_lander", "env.kwargs={enable_wind: true, wind_power: 15.0, turbulence_power: 1.5}"],
+    "lander_wind": [
+        "env=lunar_lander",
+        "++env.kwargs.enable_wind=true",
+        "++env.kwargs.wind_power=15.0",
+        "++env.kwargs.turbulence_power=1.5",
+    ],
+    "pendulum": ["env=pendulum_v1"],
 }
 LEARNERS = ("asql", "deep_s1")
+OF_BOXES = {"pendulum": ("asac", "deep_s1")}
 SEEDS = range(10)
 EPISODES = 100
 
@@ -45,7 +53,7 @@ def measured(task: str, name: str, seed: int) -> dict[str, float]:
     """One run."""
     cfg = composed(configurations.folder(), "train", [*TASKS[task], f"learner={name}"])
     problem = make_network_problem(cfg)
-    learner = made(cfg.learner, resolve(cfg.learner["class"], "learner.class"), "learner")
+    learner = suited(made(cfg.learner, resolve(cfg.learner["class"], "learner.class"), "learner"), problem)
     began = time.process_time()
     *_, state = learner.run(problem, Live(problem, seed))
     seconds = time.process_time() - began
@@ -111,7 +119,7 @@ def main() -> None:
     path = OUT / "networks.json"
     results = json.loads(path.read_text()) if path.exists() else {}
     for task in sys.argv[1:] or ("strip", "cart_pole", "acrobot", "mountain_car"):
-        for name in LEARNERS:
+        for name in OF_BOXES.get(task, LEARNERS):
             done = results.setdefault(task, {}).setdefault(name, {})
             for seed in SEEDS:
                 if str(seed) not in done:

@@ -173,7 +173,7 @@ def test_bad_runs_get_one_line(cliff, tmp_path):
     good = f"run={cliff}"
     assert (
         complaint("run=nowhere")
-        == "run=nowhere: must be a run directory of train.py, with solution.npz or replicas.npz"
+        == "run=nowhere: must be a run directory of train.py, with solution.npz or replicas.npz or policy.safetensors"
     )
     assert complaint(good, "replica=0").startswith("replica=0: must be left out")
     assert complaint(good, "render=video") == "render=video: must be ansi or gif or none"
