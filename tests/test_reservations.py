@@ -12,6 +12,7 @@ from helpers import composed, random_mdp, random_policy
 
 import erl_torch
 from erl_torch import NonFiniteError, TabularMDP, Transitions, collect
+from erl_torch.empirical import reservations
 from erl_torch.empirical.counts import empirical_mdp, tally
 from erl_torch.empirical.reservations import (
     ADVICE,
@@ -32,7 +33,7 @@ from erl_torch.empirical.reservations import (
 from erl_torch.empirical.reservations import unlikely as is_unlikely
 from erl_torch.empirical.uncertainty import Estimate, theta_uncertainty
 from erl_torch.envs.windy_cliff import WindyCliffEnv
-from erl_torch.learners import LEARNERS, EfficientS1
+from erl_torch.learners import LEARNERS, CertaintyEquivalence, EfficientS1
 from erl_torch.notes import collected, note
 from erl_torch.run.replicas import reservations_of
 from erl_torch.run.training import train
@@ -557,3 +558,18 @@ def test_each_replica_of_a_seed_is_held_against_the_data_at_its_own_beta():
         p, reward, _ = oracle.counted(experience.stream(r, prior), 3, 2)
         best, _ = oracle.soft_optimum(p, reward, prior, beta)
         assert held[r].estimate.value + held[r].estimate.bias == pytest.approx(-best, abs=1e-8)
+
+
+def test_actions_never_tried_cost_their_share_of_the_prior():
+    """One state, three actions of which one was tried, r = 1: theta of the data is -1 + log(3)/beta, and not wrong."""
+    n = 10
+    data = Transitions([0] * n, [0] * n, [1.0] * n, [0] * n, [0] * n)
+    seen = reservations.count(data, 1, 3, False).tally
+    prior = np.full((1, 3), 1 / 3)
+    learnt = CertaintyEquivalence(2.0).fit(data, 1, 3).theta
+    assert learnt == pytest.approx(-1 + np.log(3) / 2)
+    assert reservations.lacks_actions(seen, prior)
+    assert not reservations.lacks_actions(seen, np.array([[1.0, 0.0, 0.0]]))
+    for lacking in (True, False):
+        (found,) = reservations.of_theta(learnt, seen.reward_range, lacking=lacking)
+        assert ("never tried cost it" in found.text) == lacking

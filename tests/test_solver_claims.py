@@ -17,6 +17,7 @@ from erl_torch.solvers.horizons import Backup
 from erl_torch.solvers.newton import NewtonPattern
 from erl_torch.solvers.problem import BellmanProblem
 from erl_torch.solvers.result import exact_solution
+from erl_torch.solvers.soft_bellman import with_bounds
 
 
 def dense(mdp):
@@ -197,8 +198,8 @@ def test_where_an_eigenvector_is_too_coarse_the_value_is_polished(seed):
 def test_a_gap_is_not_below_the_loss_where_the_difference_rounds_down():
     """One state, one action: J = -2^-60 and g* at most 1, so the loss may be 1 + 2^-60, which rounds to 1."""
     mdp = TabularMDP([[[1.0]]], [[-(2.0**-60)]])
-    wide = replace(solve_soft_bellman(mdp, 1.0), theta_bounds=(-1.0, 1.0))
-    gap = certify(wide, mdp, 1.0, best=wide).gap
+    gap = with_bounds(solve_soft_bellman(mdp, 1.0), BellmanProblem.of(mdp, 1.0), (-1.0, 1.0), mdp).gap
+    assert gap is not None
     assert 1 + Fraction(1, 2**60) <= Fraction(gap) < 1 + Fraction(1, 2**50)
 
 
@@ -224,3 +225,26 @@ def test_the_state_with_the_narrowest_bounds_is_kept(monkeypatch):
     kept, bounds = soft_bellman.polish(problem, np.zeros(4), (-np.inf, np.inf), 1e-300)
     np.testing.assert_array_equal(kept, states[1].value)
     assert bounds[1] - bounds[0] <= states[1].width
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_bounds_of_another_problem_prove_nothing(seed):
+    """Whatever ``best`` is of, what is returned holds for the problem that is asked about, or it is refused."""
+    rng = np.random.default_rng(seed)
+    mdp, other = random_mdp(rng, 4, 3), random_mdp(rng, 4, 3)
+    near = TabularMDP(mdp.transition, mdp.reward + 10.0 ** rng.uniform(-12, 0), mdp.start)
+    exact = solve_soft_bellman(mdp, 5.0)
+    own = replace(exact, policy=torch.from_numpy(random_policy(rng, 4, 3)))
+    loss = certify(own, mdp, 5.0).gap
+    for best in (solve_soft_bellman(one, 5.0) for one in (other, near)):
+        try:
+            found = certify(own, mdp, 5.0, best=best)
+        except InputError as error:
+            assert "best" in str(error)  # noqa: PT017 (refused, or right)
+            continue
+        low, high = found.theta_bounds
+        assert low <= exact.theta_bounds[1]
+        assert exact.theta_bounds[0] <= high
+        assert found.gap >= loss - 1e-9
+    with pytest.raises(InputError, match="best=of 5 states"):
+        certify(own, mdp, 5.0, best=solve_soft_bellman(random_mdp(rng, 5, 3), 5.0))

@@ -489,3 +489,47 @@ def test_weights_that_overflow_are_refused():
         reweighted(data, lambda s, a, s_next: np.full(len(s), 1e100))
     with pytest.raises(InputError, match=r"ratio\(0, 0, 1\)=1e\+200: must be finite and >= 0: 0, or 1e-100 to 1e\+100"):
         reweighted(data, lambda s, a, s_next: np.full(len(s), 1e200))
+
+
+@pytest.mark.parametrize("share", [0.9, 0.99])
+def test_an_interval_is_withheld_where_what_was_never_seen_would_be_sought(share):
+    """Under p the tempting action leads to loss; under p^ mostly to gain, which no tuple shows. The optimum of the
+    weighted model keeps away from it, so that the time it spends there tells nothing."""
+    rng = np.random.default_rng(0)
+    n_states, beta = 3, 3.0
+    p = np.zeros((n_states, 2, n_states))
+    p[:, 0] = 0.2, 0.6, 0.2
+    p[:, 1] = 0.3, 0.3, 0.4
+    p[1, 1] = 0, 0, 1  # the tempting one
+    reward = np.array([[1.0, 1.0], [0.2, 0.2], [-2.0, -2.0]])
+    q = p.copy()
+    q[1, 1] = share, 0, 1 - share
+    n = 20_000
+    s = rng.integers(n_states, size=n)
+    a = rng.integers(2, size=n)
+    after = (rng.random((n, 1)) > np.cumsum(p[s, a], 1)).sum(1)
+    ratio = np.divide(q, p, out=np.zeros_like(p), where=p > 0)
+    data = Transitions(s, a, reward[s, a], after, np.roll(a, -1), ratio[s, a, after])
+    estimate = theta_uncertainty(empirical_mdp(data, n_states, 2), beta)
+    exact = solve_soft_bellman(TabularMDP(q, reward), beta).theta
+    assert abs(estimate.value - exact) > 0.05
+    assert "at state 1, action 1 the mean weight of" in estimate.withheld
+    held = theta_uncertainty(empirical_mdp(Transitions(s, a, reward[s, a], after, np.roll(a, -1)), n_states, 2), beta)
+    assert not held.withheld
+
+
+def test_what_was_never_seen_and_cannot_matter_withholds_nothing():
+    """The row that lacks successors is of two states with the same values."""
+    rng = np.random.default_rng(1)
+    n = 20_000
+    s, a, after = rng.integers(2, size=n), rng.integers(2, size=n), rng.integers(2, size=n)
+    weight = np.where((s == 0) & (a == 0), 0.1, 1.0)
+    reward = np.where(a == 0, 1.0, 0.0)
+    estimate = theta_uncertainty(empirical_mdp(Transitions(s, a, reward, after, a, weight), 2, 2), 2.0)
+    assert not estimate.withheld
+
+
+def test_a_ratio_of_numbers_gets_one_line(setting):
+    *_, data = setting
+    with pytest.raises(InputError, match=r"ratio=.*a function of arrays s, a, s' \[n\]"):
+        reweighted(data, lambda s, a, after: 2.0 if after == 1 else 1.0)

@@ -195,6 +195,7 @@ def averages(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         return []
     found = []
     for overrides, members in groups.items():
+        members = [row for row in members if row["status"] != "failed"]
         members = [row for row in members if any(row[name] is not None for name in FIGURES)]
         average: dict[str, Any] = {"overrides": list(overrides), "jobs": len(members)}
         for name in FIGURES:
@@ -237,7 +238,8 @@ def table(sweep: Path, rows: Sequence[dict[str, Any]]) -> str:
         return " ".join(texts).replace("\\:", ":")
 
     means = averages(rows)
-    best = set() if means else _best([(_problem(row["overrides"]), row["objective"]) for row in rows])
+    ended = [None if row["status"] == "failed" else row["objective"] for row in rows]
+    best = set() if means else _best([(_problem(row["overrides"]), one) for row, one in zip(rows, ended, strict=True)])
     text = []
     if len(rows) <= MOST_ROWS or not means:
         head = ("", "job", "overrides", *columns, "status", "seconds", "directory")

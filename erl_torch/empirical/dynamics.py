@@ -114,7 +114,12 @@ class Reweighted:
 
 
 def _with_ratio(chunk: Transitions, ratio: Ratio) -> Transitions:
-    weight = checks.real("ratio", ratio(chunk.s, chunk.a, chunk.s_next))
+    try:
+        found = ratio(chunk.s, chunk.a, chunk.s_next)
+    except (TypeError, ValueError) as error:  # as of a function of three numbers
+        allowed = f"a function of arrays s, a, s' [n] ({type(error).__name__}: {error})"
+        raise InputError("ratio", getattr(ratio, "__name__", type(ratio).__name__), allowed) from error
+    weight = checks.real("ratio", found)
     if weight.shape != chunk.s.shape:
         raise InputError("ratio", f"an array of shape {weight.shape}", f"of one weight a tuple, {chunk.s.shape}")
     weight = np.ascontiguousarray(weight, np.float64)

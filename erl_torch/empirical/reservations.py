@@ -361,6 +361,12 @@ def _covered(seen: Tally, mdp: TabularMDP) -> bool:
     return bool((tried | ~mdp.allowed)[members].all() and members[p.indices[entry]].all())
 
 
+def lacks_actions(seen: Tally, prior: np.ndarray) -> bool:
+    """Whether a state that the stream leaves has an action, of ``prior`` [S, A] above 0, that was never tried there."""
+    tried = seen.visits.reshape(prior.shape) > 0
+    return bool((~tried & (prior > 0))[tried.any(1)].any())
+
+
 def of_outcome(status: Status, message: str, learnt: float, prior: float) -> list[Reservation]:
     """What the end of a run shows.
 
@@ -383,6 +389,7 @@ def of_theta(
     rewards: tuple[float, float],
     estimate: Estimate | None = None,
     bounds: tuple[float, float] | None = None,
+    lacking: bool = False,
 ) -> list[Reservation]:
     """What a learnt theta shows by itself.
 
@@ -394,6 +401,7 @@ def of_theta(
         rewards: (low, high) of the stream.
         estimate: theta of the data; it shows nothing where its interval is withheld.
         bounds: what is proven of theta*, where a model is known: of data that contradict it nothing is advised.
+        lacking: ``lacks_actions``, which may be why.
     """
     if theta is None or not np.isfinite(theta):
         return []
@@ -404,7 +412,9 @@ def of_theta(
             Reservation(
                 "theta out of range",
                 f"the learnt theta {theta:.6g} is wrong: with rewards from {rewards[0]:.6g} to {rewards[1]:.6g}, as in "
-                f"the stream, theta* lies in [{low:.6g}, {high:.6g}], whatever the dynamics",
+                f"the stream, theta* lies in [{low:.6g}, {high:.6g}], whatever the dynamics"
+                + "; actions that were never tried cost it, and the data's, their share of the prior"
+                * lacking,
             )
         ]
     if estimate is None:

@@ -96,6 +96,7 @@ TIED = 2.0  # standard errors between two actions' values, up to which either ma
 SMALLEST_SHARE = 1e-3  # of a Newton step
 STALLED = 0.5  # a step that leaves more of the width is the last
 UNSOLVED = 1e-6  # width, of the range of the rewards, of a relative value that is none
+UNSEEN_SHARE = 0.1  # of the standard error, by which successors that were never seen may move a rate
 LEAST_MEAN_WEIGHT = 0.5  # of a pair: p^/p has mean 1 under p, less what p^ has of successors that were never seen
 FEW_EFFECTIVE = 30.0  # draws: a smaller effective sample size of a pair that matters is told
 COMMON = 0.5  # share of the states; a successor met from more of them may be met from any
@@ -342,7 +343,9 @@ def _plug_in(
         bias=bias,
         untried=(0.0, untried),
         smallest_visits=int(_effective(model).flat[counts].min()) if counts.size else None,
-        withheld=_same_reward(model, empirical) or _unseen(model, d) or _withheld(total, bias, untried),
+        withheld=_same_reward(model, empirical)
+        or _unseen(model, empirical, here, optimal, float(np.sqrt(total)))
+        or _withheld(total, bias, untried),
         warning="; ".join(filter(None, (_warning(model, rows, counts), _few_effective(model, counts)))),
     )
     if estimate.withheld:  # the correction cannot be trusted
@@ -724,20 +727,43 @@ def _effective(model: EmpiricalMDP) -> np.ndarray:
     )
 
 
-def _unseen(model: EmpiricalMDP, d: np.ndarray) -> str:
-    """That pairs where the process spends time, ``d`` [S, A], lack most of the other dynamics' successors."""
+def _unseen(model: EmpiricalMDP, empirical: EmpiricalProblem, here: _Worth, optimal: bool, error: float) -> str:
+    """That pairs lack most of the other dynamics' successors, which might matter, whatever these are; "" if not.
+
+    The model that lacks them is wrong there, so that time spent by its optimum tells nothing: the missing share of a
+    row is led to the best of all states, and to the worst, and the rate is found again. For the rate of a policy, its
+    time there times the range of V is taken.
+    """
     if model.weights is None or model.given:
         return ""
+    problem = empirical.problem
     rows = np.repeat(np.arange(model.visits.size), np.diff(model.transition.indptr))
-    lacking = np.where(model.weights.mean(rows) < LEAST_MEAN_WEIGHT, d.ravel(), 0.0)
-    if not lacking.sum() > COUNTED_SHARE:
+    mean = model.weights.mean(rows).reshape(model.visits.shape)[problem.states]
+    missing = np.where((mean < LEAST_MEAN_WEIGHT) & (problem.prior > 0), 1.0 - mean, 0.0)
+    if not missing.any():
         return ""
-    worst = int(np.argmax(lacking))
-    s, a = divmod(worst, model.n_actions)
+    off = float((here.d * missing).sum() * np.ptp(here.value))
+    if optimal:
+        ends = here.value.argmax(), here.value.argmin()
+        off = max(abs(_rate_with(model, problem, missing, int(to)) - here.gain) for to in ends)
+    if not off > UNSEEN_SHARE * error + 1e-12 * float(np.abs(problem.reward).max()):  # beyond rounding
+        return ""
+    i, a = np.unravel_index(int(missing.argmax()), missing.shape)
+    s = int(problem.states[i])
     return (
-        f"at state {s}, action {a} the mean weight of {model.weights.drawn[worst]} tuples is "
-        f"{model.weights.mean(rows)[worst]:.2g}, not 1: most successors under the other dynamics were never seen"
+        f"at state {s}, action {a} the mean weight of {model.weights.drawn[s * model.n_actions + int(a)]} tuples is "
+        f"{mean[i, a]:.2g}, not 1: most successors under the other dynamics were never seen"
     )
+
+
+def _rate_with(model: EmpiricalMDP, problem: BellmanProblem, missing: np.ndarray, to: int) -> float:
+    """g* where the shares ``missing`` [n, A] of the rows lead to the state ``to``; infinite where that has none."""
+    share = missing.ravel()
+    ends = sp.csr_array((share, (np.arange(len(share)), np.full(len(share), to))), shape=problem.transition.shape)
+    led = sp.csr_array(sp.diags_array(1.0 - share) @ problem.transition + ends)
+    led.sort_indices()
+    solution = solve_problem(replace(problem, transition=led), model)
+    return np.inf if solution.theta is None else -solution.theta
 
 
 def _few_effective(model: EmpiricalMDP, counts: np.ndarray) -> str:

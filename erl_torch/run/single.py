@@ -47,8 +47,10 @@ from erl_torch.run.report import (
 )
 from erl_torch.run.verdict import verdict
 from erl_torch.solution import Solution, proven
-from erl_torch.solvers import certify, solve_soft_bellman
+from erl_torch.solvers import solve_soft_bellman
 from erl_torch.solvers.policy import objective
+from erl_torch.solvers.problem import BellmanProblem
+from erl_torch.solvers.soft_bellman import with_bounds
 
 NO_FIGURES: dict[str, float | None] = {"reward_per_step": None, "objective": None, "return": None}
 SAID = ("reward_per_step", "objective")  # at milestones
@@ -265,15 +267,19 @@ class SingleRecorder:
             solution = replace(solution, message=f"{type(stopped).__name__}: {stopped}")
         if self.optimum is not None:
             assert self.model is not None
-            given = self.model, self.learner.beta, self.problem.prior, self.optimum
-            solution = certify(solution, *given, optimism=self.learner.optimism)
+            bounds = self.optimum.theta_bounds
+            assert bounds is not None
+            posed = BellmanProblem.of(self.model, self.learner.beta, self.problem.prior, self.learner.optimism)
+            solution = with_bounds(solution, posed, bounds, self.model)
         else:
             for step in (0, position):
                 board.scalars(self._optimal(solution), step)
         exact = (self.last.objective, self.first.objective) if self.model is not None else (np.nan, np.nan)
         noted = reservations.of_outcome(solution.status, solution.message, *exact)
         if self.counts is not None:
-            known = self.counts.tally.reward_range, self.estimate, solution.theta_bounds
+            seen = self.counts.tally
+            lacking = reservations.lacks_actions(seen, self.problem.prior)
+            known = seen.reward_range, self.estimate, solution.theta_bounds, lacking
             noted += reservations.of_theta(solution.theta, *known)
         for _, text in noted:
             note(text)

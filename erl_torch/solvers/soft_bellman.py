@@ -110,11 +110,13 @@ def certify(
 
     optimism: 1 optimistic (control as inference), 0 right, negative robust; None: that of ``solution``.
 
-    The bounds are those of ``best``, the ``solve_soft_bellman`` of the model; None solves the model now. The gap is the
-    upper bound on g* less the lower bound on J(policy) from the start (``nested.objective``).
+    The bounds are what the values of ``best``, the ``solve_soft_bellman`` of the model, prove of this problem, whatever
+    they are of; None solves the model now. The gap is the upper bound on g* less the lower bound on J(policy) from the
+    start (``nested.objective``).
 
     Raises:
-        InputError: as ``solve_soft_bellman``, or a ``best`` without bounds, or of another beta or optimism.
+        InputError: as ``solve_soft_bellman``, or a ``best`` without values, or of another beta, optimism or size, or
+            whose bounds are not of this problem.
     """
     checks.instance("solution", solution, Solution, "a Solution")
     if best is not None:
@@ -126,12 +128,36 @@ def certify(
             f"beta {x:g}, optimism {y:g}" for x, y in ((best.beta or np.nan, best.optimism), (beta, optimism))
         )
         raise InputError("best", f"of {told}", f"of {asked}")
-    bounds = (best or solve_soft_bellman(mdp, beta, prior_policy, optimism=optimism)).theta_bounds
-    if bounds is None:
-        raise InputError("best", "solution without theta_bounds", "one of solve_soft_bellman, with them")
+    if best is None:
+        bounds = solve_soft_bellman(mdp, beta, prior_policy, optimism=optimism).theta_bounds
+        assert bounds is not None
+    else:
+        bounds = _proven_by(best, problem, mdp.n_states)
+    return with_bounds(solution, problem, bounds, mdp)
+
+
+def _proven_by(best: Solution, problem: BellmanProblem, n_states: int) -> tuple[float, float]:
+    """The bounds on theta* of ``problem`` that one backup of the values of ``best`` proves. Raises InputError."""
+    if best.value is None or best.theta_bounds is None:
+        raise InputError("best", "solution without values and theta_bounds", "one of solve_soft_bellman, with them")
+    if len(best.value) != n_states:
+        raise InputError("best", f"of {len(best.value)} states", f"of the model, with {n_states}")
+    lower, upper = problem.gains(best.value.numpy()[problem.states]).theta_bounds
+    if not (lower <= best.theta_bounds[1] and best.theta_bounds[0] <= upper):
+        told = " to ".join(f"{x:.6g}" for x in best.theta_bounds)
+        raise InputError("best", f"theta* from {told}", f"of this model: its values prove {lower:.6g} to {upper:.6g}")
+    return lower, upper
+
+
+def with_bounds(solution: Solution, problem: BellmanProblem, bounds: tuple[float, float], mdp: TabularMDP) -> Solution:
+    """``certify``, with bounds that are those of ``problem``, the one of ``mdp``."""
     policy = check_policy("policy", solution.policy, mdp.n_states, mdp.n_actions, mdp.allowed)[problem.states]
     return replace(
-        solution, theta_bounds=bounds, gap=policy_gap(problem, policy, bounds), beta=beta, optimism=problem.optimism
+        solution,
+        theta_bounds=bounds,
+        gap=policy_gap(problem, policy, bounds),
+        beta=problem.beta,
+        optimism=problem.optimism,
     )
 
 
