@@ -327,6 +327,15 @@ def test_problems_are_compared_by_their_gaps(tmp_path):
     assert not sweeps.averages(rows)
 
 
+def test_a_failed_job_is_no_best_one(tmp_path):
+    """Its figures are those of its last good tables."""
+    rows = [job(i, [f"learner.rate={i}"], value) for i, value in enumerate((-0.40, -0.41, -0.42))]
+    rows[0] |= {"status": "failed", "complaint": "step 9: theta is nan"}
+    lines = sweeps.table(tmp_path, rows).splitlines()
+    (best,) = (line for line in lines if line.startswith("*") and "learner.rate" in line)
+    assert "learner.rate=1" in best
+
+
 @pytest.mark.slow
 def test_swept_environments_share_one_directory(tmp_path, typed_here, mine):
     envs = "env=windy_cliff,FrozenLake-v1,CliffWalkingSlippery-v1,mine:Mine-v0"

@@ -441,7 +441,7 @@ def test_streams_in_another_order_are_another_run(tmp_path, tuples):
     streams = [tuples, erl_torch.collect(MDP, 20, 200, seed=1)]
     replicas = Replicas.of(SHORT, 2)
     erl_torch.train(replicas, MDP, streams, directory=tmp_path, evaluation=QUICK)
-    with pytest.raises(InputError, match="with these settings, or a new one: not digest="):
+    with pytest.raises(InputError, match="with these settings, or a new one: not these tuples"):
         erl_torch.train(replicas, MDP, streams[::-1], directory=tmp_path, evaluation=QUICK)
 
 

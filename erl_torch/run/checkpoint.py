@@ -37,6 +37,7 @@ from erl_torch.solution import Solution, Status
 
 FORMAT = 4  # 1 knew no settings, 2 no types of NumPy's numbers, 3 not which epoch was recorded last
 KEPT = 2
+MOST_TOLD = 80  # letters of a setting in a message
 RESULTS = ("result.json", "solution.npz", "replicas.npz")
 FILES = (
     "settings.json",
@@ -192,10 +193,19 @@ class Checkpoints:
         keys = {**before, **self._settings}.keys() - FREE
         differ = sorted(key for key in keys if before.get(key) != self._settings.get(key))
         if differ:
-            shown = ", ".join(f"{key}={self._settings.get(key)} (there: {before.get(key)})" for key in differ[:5])
+            differ.sort(key=lambda key: key.rpartition(".")[2] not in ("class", "name", "module"))  # what explains others
+            shown = ", ".join(_differs(key, self._settings.get(key), before.get(key)) for key in differ[:5])
             more = f" and {len(differ) - 5} more" if len(differ) > 5 else ""
             allowed = f"of a run with these settings, or a new one: not {shown}{more}"
             raise InputError(self.key, self.directory, allowed)
+
+
+def _differs(key: str, ours: object, theirs: object) -> str:
+    """One setting that two runs do not share, in a few words."""
+    if key == "digest":
+        return "these tuples (there: others)"
+    told = [text if len(text := str(value)) <= MOST_TOLD else f"{text[:MOST_TOLD]}..." for value in (ours, theirs)]
+    return f"{key}={told[0]} (there: {told[1]})"
 
 
 def rows_of(found: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
