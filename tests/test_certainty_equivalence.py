@@ -3,6 +3,7 @@
 import re
 
 import hypothesis
+import mpmath
 import numpy as np
 import oracle
 import pytest
@@ -219,3 +220,29 @@ def test_data_whose_closed_set_has_no_single_rate():
     assert found.status is Status.NO_SINGLE_RATE
     assert found.theta is None
     assert re.search(r"-?\d", found.message)
+
+
+@pytest.mark.parametrize("optimism", [10.0**-k for k in (3, 6, 9, 12, 14, 16, 20, 50, 90)])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_rewards_that_count_together_are_continuous_at_optimism_0(optimism, sign):
+    """theta(o) - theta(0) is of order o: a difference of logarithms lost all digits."""
+    rng = np.random.default_rng(0)
+    n = 1000
+    s, a, after = rng.integers(3, size=n), rng.integers(2, size=n), rng.integers(3, size=n)
+    data = Transitions(s, a, rng.normal(size=n) + s, after, a)
+    plain = CertaintyEquivalence(5.0).fit(data, 3, 2).theta
+    found = CertaintyEquivalence(5.0, reward_noise="joint", optimism=sign * optimism).fit(data, 3, 2).theta
+    assert abs(found - plain) <= 20 * optimism + 1e-9
+
+
+def test_rewards_that_count_together_are_their_certainty_equivalent():
+    """One state and action: theta = -(1/kappa) log <exp(kappa r)>, by mpmath, near and far from the mean."""
+    rng = np.random.default_rng(1)
+    r = rng.normal(size=50) * 3 + 7
+    data = Transitions([0] * 50, [0] * 50, r, [0] * 50, [0] * 50)
+    for optimism in (1e-12, 1e-4, 0.05, 0.5, 1.0, 30.0, -1e-9, -0.3, -20.0):
+        kappa = mpmath.mpf(optimism) * 2
+        with mpmath.workdps(60):
+            exact = mpmath.log(sum(mpmath.exp(kappa * mpmath.mpf(float(x))) for x in r) / 50) / kappa
+        found = CertaintyEquivalence(2.0, reward_noise="joint", optimism=optimism).fit(data, 1, 1).theta
+        assert found == pytest.approx(-float(exact), rel=1e-12)

@@ -406,3 +406,11 @@ def test_intervals_are_continuous_at_0(optimism):
     there, near = (theta_uncertainty(model, 3.0, optimism=x) for x in (0.0, optimism))
     assert near.value == pytest.approx(there.value, abs=1e-8)
     np.testing.assert_allclose(near.interval(), there.interval(), atol=1e-6)
+
+
+def test_optimism_that_streams_lose_is_refused():
+    """Within 1e-8 of 0 theta lost its digits; certainty equivalence keeps them."""
+    for near in (1e-9, -1e-14):
+        with pytest.raises(InputError, match="optimism=.*0, or at least 1e-08 in size"):
+            EfficientS1(5.0, optimism=near)
+    assert EfficientS1(5.0, optimism=1e-8).optimism == 1e-8

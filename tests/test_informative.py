@@ -93,3 +93,11 @@ def test_a_run_learns_from_it(tmp_path):
     prior = Judge(mdp, np.full((15, 4), 0.25), 1000).objective(np.full((15, 4), 0.25), 10.0)
     assert prior < result["objective"] <= -1.0101363366
     assert result["objective"] > -1.0101363366 - 0.002
+
+
+def test_one_stream_is_not_designed_for_several_problems(tmp_path):
+    """Replicas of other beta would each need a stream of their own."""
+    few = ("env=windy_cliff", "experience=informative", "learner=s1_efficient", "experience.n_episodes=5")
+    for key in ("beta", "optimism"):
+        with pytest.raises(InputError, match=rf"vary.{key}=.*one value, for which the stream is designed"):
+            train(composed(*few, f"+vary.{key}=[0.5,1]"), tmp_path / key)

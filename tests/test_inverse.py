@@ -721,3 +721,24 @@ def test_gap_is_what_the_demonstrated_policy_loses(optimism):
     own = rate(lambda q: (policy * (q - np.log(policy / prior) / beta)).sum(1))
     assert fit.gap == pytest.approx(best - own, abs=1e-9)
     assert fit.gap > 1e-3
+
+
+@pytest.mark.parametrize("optimism", [0.0, 1.0])
+@pytest.mark.parametrize("kind", ["constant", "shaping", "both"])
+def test_features_that_tell_nothing_identify_nothing(kind, optimism):
+    """A constant, and Phi(s) - E Phi(s'): no behaviour depends on either, at optimism 0 (a constant at any)."""
+    rng = np.random.default_rng(1)
+    p = rng.dirichlet(np.ones(4), (4, 2))
+    constant = np.ones((4, 2, 1))
+    shaping = (np.arange(4.0)[:, None] - p @ np.arange(4.0))[:, :, None]
+    features = {"constant": constant, "shaping": shaping, "both": np.concatenate([constant, shaping], 2)}[kind]
+    if optimism and kind != "constant":
+        pytest.skip("shaping changes what an optimist does")
+    counts = rng.integers(1, 50, (4, 2))
+    found = fit_reward(
+        counts, features, mdp=TabularMDP(p, np.zeros((4, 2)), np.full(4, 0.25)), beta=3.0, optimism=optimism
+    )
+    assert not found.identified.any()
+    assert found.unidentified.shape == (features.shape[2], features.shape[2])
+    assert found.standard_error is None or np.isinf(found.standard_error).all()
+    assert found.gap == 0 or not np.signbit(found.gap)

@@ -359,6 +359,8 @@ def joint(model: EmpiricalMDP, data: Experience, kappa: float) -> EmpiricalMDP:
     p = model.transition
     row = np.repeat(np.arange(p.shape[0]), np.diff(p.indptr))
     largest, total = np.full(p.nnz, -np.inf), np.zeros(p.nnz)
+    mean = model.reward.ravel()
+    off, widest = np.zeros((2, p.shape[0]))  # of kappa (r - mean r): the sum of expm1, the largest size
     for sums in (False, True):
         for chunk in data.chunks():
             entry, weight = (
@@ -367,6 +369,10 @@ def joint(model: EmpiricalMDP, data: Experience, kappa: float) -> EmpiricalMDP:
             )
             if sums:
                 np.add.at(total, entry, weight * np.exp(kappa * chunk.r - largest[entry]))
+                pair = row[entry]
+                x = kappa * (chunk.r - mean[pair])
+                np.maximum.at(widest, pair, np.abs(x))
+                np.add.at(off, pair, weight * np.expm1(np.minimum(x, 1.0)))
             else:
                 np.maximum.at(largest, entry, kappa * chunk.r)
     first = p.indptr[:-1][np.diff(p.indptr) > 0]
@@ -376,6 +382,9 @@ def joint(model: EmpiricalMDP, data: Experience, kappa: float) -> EmpiricalMDP:
     log_mean[row[first]] = np.logaddexp.reduceat(log_share, first)
     # A share that underflows stays a successor.
     share = np.where(varied[row], np.maximum(np.exp(log_share - log_mean[row]), 1e-300), p.data)
-    reward = np.where(varied, log_mean / kappa, model.reward.ravel())
+    # Where all is close to the mean, the difference of logarithms would lose what kappa divides.
+    n = np.bincount(row, visits[row] * p.data, p.shape[0]) if model.weights is None else visits
+    near = mean + np.log1p(off / np.maximum(n, np.finfo(float).tiny)) / kappa
+    reward = np.where(varied, np.where(widest <= 1.0, near, log_mean / kappa), mean)
     transition = sp.csr_array((share, p.indices, p.indptr), shape=p.shape)
     return replace(model, transition=transition, reward=reward.reshape(model.reward.shape))

@@ -67,6 +67,8 @@ def reweighted(experience: Experience, ratio: Ratio) -> Experience:
         InputError: a weight that is not as above, named by its tuple; a pair all of whose tuples have weight 0, named.
     """
     checks.instance("experience", experience, Experience, EXPERIENCE)
+    if not callable(ratio):
+        raise InputError("ratio", ratio, "a function of arrays s, a, s' [n]")
     if isinstance(experience, Transitions):
         found: Experience = _with_ratio(experience, ratio)
     else:

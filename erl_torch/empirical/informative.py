@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -56,7 +57,8 @@ def informative_policy(
         model: what is known so far.
         beta, prior_policy, optimism: of the problem, as in ``theta_uncertainty``.
         n_more: tuples to come, >= 1.
-        explore: in [0, 1], share of the prior in each state, for what was never met.
+        explore: in [0, 1], share of the prior in each state, for what was never met. It is mixed in afterwards: the
+            design does not know of it.
 
     Returns:
         The policy; the prior in states that the data do not know, and everywhere where they give no interval.
@@ -64,6 +66,7 @@ def informative_policy(
     Raises:
         InputError: an argument out of range.
     """
+    checks.instance("model", model, EmpiricalMDP, "an EmpiricalMDP, as of empirical_mdp")
     n_more = checks.at_least("n_more", n_more, 1)
     explore = checks.number("explore", explore, *SHARE)
     prior = check_prior("prior_policy", prior_policy, model.n_states, model.n_actions)
@@ -219,6 +222,8 @@ class Informative(Source):
     Raises:
         InputError: an argument out of its range.
     """
+
+    designed_for: ClassVar[tuple[str, ...]] = ("beta", "optimism")
 
     beta: float
     optimism: float = 0.0

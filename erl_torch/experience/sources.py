@@ -34,6 +34,7 @@ class Source(ABC):
 
     one_stream: ClassVar[bool] = False  # the stream is the same for every seed
     work: ClassVar[str] = "collecting"  # in the progress bar
+    designed_for: ClassVar[tuple[str, ...]] = ()  # settings of the learner that the stream depends on
 
     @abstractmethod
     def __call__(self, problem: Problem, seed: int, report: Report) -> Experience:

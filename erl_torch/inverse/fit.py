@@ -39,6 +39,7 @@ from erl_torch.solvers.problem import BellmanProblem
 from erl_torch.solvers.soft_bellman import solve_problem
 
 TOLD = 1e-9  # of singular values of the advantages, relative to the largest: below, behaviour tells nothing
+ROUNDING = 1e-12  # of an advantage, relative to the size of its feature
 WIDTH = 1e-9  # of TV - V, relative to the rewards' range, at which a value is a solution
 WARM_STEPS = 8  # Newton steps from the value of the reward before
 FALLS = (1e-8, 1e-13)  # of the objective in a step, relative, at which L-BFGS hands over to scoring; its second try
@@ -378,7 +379,8 @@ def _directions(objective: _Objective, at: Linearised) -> _Space:
     scaled = _advantages(objective, at)[objective.base.prior.ravel() > 0]
     n_pairs, n_features = scaled.shape
     _, sizes, axes = np.linalg.svd(scaled, full_matrices=n_features > n_pairs)
-    rank = int((sizes > max(TOLD * sizes[0], 1e-300)).sum())
+    # Of features that tell nothing at all, rounding is left: their sizes are 1, so that of a column is sqrt(n_pairs).
+    rank = int((sizes > max(TOLD * sizes[0], ROUNDING * np.sqrt(n_pairs))).sum())
     own = np.sqrt((axes[rank:] ** 2).sum(0)) < PART
     scale = objective.scale
     if rank == n_features:  # the features themselves are coordinates, and no sizes mix
@@ -468,7 +470,7 @@ def _gap(expert: Demonstrated, at: Linearised) -> float:
     p, policy = at.problem, expert.policy
     reward = np.repeat(-loss[:, None], policy.shape[1], axis=1)
     worth = nested.objective(at.tilted, reward, policy, p.beta, policy, p.start, optimism=p.optimism)
-    return max(-worth.value, 0.0)
+    return max(-worth.value, 0.0) + 0.0  # no -0
 
 
 def _divergence(policy: np.ndarray, at: Linearised) -> np.ndarray:

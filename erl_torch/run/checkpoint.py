@@ -193,7 +193,7 @@ class Checkpoints:
         keys = {**before, **self._settings}.keys() - FREE
         differ = sorted(key for key in keys if before.get(key) != self._settings.get(key))
         if differ:
-            differ.sort(key=lambda key: key.rpartition(".")[2] not in ("class", "name", "module"))  # what explains others
+            differ.sort(key=lambda key: key.rpartition(".")[2] not in ("class", "name", "module"))
             shown = ", ".join(_differs(key, self._settings.get(key), before.get(key)) for key in differ[:5])
             more = f" and {len(differ) - 5} more" if len(differ) > 5 else ""
             allowed = f"of a run with these settings, or a new one: not {shown}{more}"

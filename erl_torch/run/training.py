@@ -240,7 +240,14 @@ def _replicas(
         one.start(problem)
     replicas = Replicas(tuple(learners), cfg.threads or os.cpu_count() or 1)
     seeds = [cfg.seed + i for _ in groups for i in range(cfg.n_replicas)]
-    experience = make_replica_experience(cfg, _source(cfg, log), problem, seeds, safe_point)
+    source = _source(cfg, log)
+    for key in source.designed_for:
+        if key in vary and not cfg.shared_stream:
+            allowed = (
+                f"one value, for which the stream is designed (or shared_stream=true; or a sweep, -m learner.{key}=A,B)"
+            )
+            raise InputError(f"vary.{key}", vary[key], allowed)
+    experience = make_replica_experience(cfg, source, problem, seeds, safe_point)
     replicas, problem = as_told(replicas, problem)
     experience = replicas.permitted(experience, problem.n_states, problem.n_actions, note)
     title = Title(cfg.env.name, cfg.learner.name, cfg.seed)

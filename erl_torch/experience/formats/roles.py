@@ -52,8 +52,11 @@ def roles_of(source: Table, columns: Mapping[str, Any] | None) -> Roles:
             raise InputError(f"path={source.path}: {role}", " and ".join(found), allowed)
         if found:
             roles[role] = (found[0],)
-    if "weight" not in {*roles, *(columns or {})} and set(source.names) >= OUR_OWN and "weight" not in taken:
-        roles["weight"] = ("weight",)
+    if "weight" not in {*roles, *(columns or {})}:
+        by_name = {plain(name): name for name in source.names}
+        weight = by_name.get("weight")
+        if weight is not None and by_name.keys() >= OUR_OWN and weight not in taken:
+            roles["weight"] = (weight,)
     _check(source, roles, there)
     return roles
 

@@ -120,6 +120,7 @@ SAFE_RANGE = 180.0  # of logarithms, for plain numbers: products of four such st
 DAMPING = 0.9  # step of value iteration on the counts
 SWEPT_PER_TUPLE = 8  # entries of the counts that it may read at a phase's end, for each tuple so far
 WIDE = 0.003  # width of a certificate, relative to what its policy meets, beyond which a run is no success
+LEAST_OPTIMISM = 1e-8  # in size, but for 0
 LEAST_EVERY = 1024  # tuples of the online mode between looks for the least y, and at least one a state
 STATE_SWEEPS = 32  # its sweeps at most for the policy of a state that is yielded
 
@@ -330,7 +331,8 @@ class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
 
     Args:
         beta: inverse temperature, 1/reward, > 0.
-        optimism: 1 optimistic (control as inference), 0 right (the paper), negative robust; any number.
+        optimism: 1 optimistic (control as inference), 0 right (the paper), negative robust; any number but those
+            within 1e-8 of 0, where streamed numbers lose their digits.
         reward_noise: "mean", or "joint": rewards that vary for the same (s,a) count together with s'.
         lr_u, lr_rho: step sizes in (0, 1]; lr_rho None is lr_u / n_states. With ``clocks``, lr_u counts for nothing
             else.
@@ -381,6 +383,9 @@ class EfficientS1(StreamLearner[EfficientState, EfficientStream]):
         checks.plain(self)
         checks.temperature("beta", self.beta)
         checks.optimism("optimism", self.optimism, self.beta)
+        if 0 < abs(self.optimism) < LEAST_OPTIMISM:  # what is streamed is divided by it
+            allowed = f"0, or at least {LEAST_OPTIMISM:g} in size (CertaintyEquivalence takes smaller ones)"
+            raise InputError("optimism", self.optimism, allowed)
         checks.step_size("lr_u", self.lr_u)
         if self.lr_rho is not None:
             checks.step_size("lr_rho", self.lr_rho)
