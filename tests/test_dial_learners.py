@@ -411,6 +411,6 @@ def test_intervals_are_continuous_at_0(optimism):
 def test_optimism_that_streams_lose_is_refused():
     """Within 1e-8 of 0 theta lost its digits; certainty equivalence keeps them."""
     for near in (1e-9, -1e-14):
-        with pytest.raises(InputError, match="optimism=.*0, or at least 1e-08 in size"):
+        with pytest.raises(InputError, match=r"optimism=.*0, or at least 1e-08 in size"):
             EfficientS1(5.0, optimism=near)
     assert EfficientS1(5.0, optimism=1e-8).optimism == 1e-8
