@@ -17,7 +17,7 @@ from erl_torch import CertaintyEquivalence, TabularMDP, Transitions, solve_soft_
 from erl_torch.envs.windy_cliff import WindyCliffEnv
 from erl_torch.networks.learner import AverageSoftQ, DeepS1, NetworkLearner
 from erl_torch.networks.problem import BoxProblem
-from erl_torch.networks.replay import Steps
+from erl_torch.networks.replay import Recorded, Steps
 from erl_torch.solvers.policy import objective
 
 BETA, N = 10.0, 20_000
@@ -61,8 +61,7 @@ def main() -> None:
     rows: dict[str, list[float]] = {name: [] for name in (*LEARNERS, "certainty equivalence")}
 
     def learnt(learner: NetworkLearner, data: Steps, seed: int) -> float:
-        state = learner.begin(where, data, seed)
-        *_, state = learner.run(where, data, state)
+        *_, state = learner.run(where, Recorded(data, seed))
         policy = learner.policy(where, state)
         assert callable(policy)
         return gap(policy(one))

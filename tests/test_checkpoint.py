@@ -316,7 +316,7 @@ def test_an_error_after_the_learning_keeps_it(tmp_path, monkeypatch):
 
     cfg = composed(*SMALL, *SHORT["s1"])
     with monkeypatch.context() as patch:
-        patch.setattr("erl_torch.run.single.certify", failing)
+        patch.setattr("erl_torch.run.single.with_bounds", failing)
         with pytest.raises(MemoryError):
             train(cfg, tmp_path)
     result = json.loads((tmp_path / "result.json").read_text())

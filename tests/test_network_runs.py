@@ -185,7 +185,6 @@ def test_play_of_a_network(tmp_path, capsys):
     ("overrides", "said"),
     [
         (["env=windy_cliff"], "env=windy_cliff: must be one with observations in a Box"),
-        (["env=windy_strip", "experience=recorded", "experience.path=x.csv"], "experience=recorded: must be simulate"),
         (["env=windy_strip", "+vary.beta=[1,2]"], "vary="),
         (["env=mountain_car_v0", "env.end_reward=auto"], "env.end_reward=auto: must be a number"),
         (["env=mountain_car_v0", "env.failures=none"], "env.failures=none: must be default or all"),

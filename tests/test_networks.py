@@ -14,10 +14,11 @@ from erl_torch import InputError, NonFiniteError, solve_soft_bellman
 from erl_torch.envs.windy_cliff import WindyCliffEnv
 from erl_torch.networks import autograd, kernels
 from erl_torch.networks.episodes import Stage
+from erl_torch.networks.export import export_policy
 from erl_torch.networks.layout import mlp
 from erl_torch.networks.learner import LIMIT, AverageSoftQ, DeepS1
 from erl_torch.networks.live import Exploration, Live
-from erl_torch.networks.policy import NetworkPolicy, Prior, load_policy
+from erl_torch.networks.policy import ActorPolicy, NetworkPolicy, Prior, load_policy
 from erl_torch.networks.problem import BoxProblem
 from erl_torch.networks.replay import COLUMNS, Replay, Steps
 from erl_torch.networks.seeds import Seeds
@@ -279,6 +280,22 @@ def test_the_fixed_point_of_hubers_loss_is_not_the_optimum():
     assert lost == pytest.approx(0.0910, abs=2e-4)
 
 
+def test_one_power_step_is_relative_value_iteration():
+    """V + (1/beta) log M_V 1 = TV, M_V written out: sum_a pi0 exp(beta (r + E V - V(s))) times E 1."""
+    mdp, beta = WindyCliffEnv().mdp, 10.0
+    p = mdp.transition.toarray().reshape(mdp.n_states, mdp.n_actions, mdp.n_states)
+    v = np.random.default_rng(0).normal(size=mdp.n_states)
+    q = mdp.reward + p @ v
+    m = np.einsum("sa,sat->st", np.exp(beta * (q - v[:, None])) / mdp.n_actions, p)
+    once = v + np.log(m @ np.ones(mdp.n_states)) / beta
+    assert once == pytest.approx(logsumexp(beta * q, axis=1, b=1 / mdp.n_actions) / beta)
+    solved = solve_soft_bellman(mdp, beta)
+    again = solved.value.numpy()
+    kept = mdp.reward + p @ again
+    rate = logsumexp(beta * kept, axis=1, b=1 / mdp.n_actions) / beta - again
+    assert rate == pytest.approx(-solved.theta)  # a fixed point, but for the rate
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_shift_of_all_values_changes_neither_policy_nor_theta(kind):
     """V + c: the last biases of Q and V, in weights and lagged copy, and g, all by c."""
@@ -517,3 +534,18 @@ def test_replay_of_recorded_tuples_keeps_all():
     assert (replay.n, replay.capacity) == (40, 40)
     with pytest.raises(InputError, match="reward"):
         Steps(np.zeros((3, 2)), np.zeros(3, int), np.zeros(2), np.zeros((3, 2)), np.zeros(3, bool))
+
+
+@pytest.mark.slow
+def test_a_policy_leaves_as_a_program_of_torch(tmp_path):
+    """Three lines without the package: for any number of observations."""
+    rng = np.random.default_rng(0)
+    layout = mlp(4, (9, 7), 2)
+    discrete = NetworkPolicy(layout, torch.from_numpy(layout.start(rng)), 3.25)
+    actor = ActorPolicy(layout, torch.from_numpy(layout.start(rng)), (-2.0,), (4.0,))
+    for name, policy, expected in (("q", discrete, discrete), ("actor", actor, actor.best)):
+        path = export_policy(policy, tmp_path / f"{name}.pt2")
+        program = torch.export.load(path).module()
+        for n in (1, 2, 30):
+            x = rng.normal(size=(n, 4)).astype(np.float32)
+            assert program(torch.from_numpy(x)).detach().numpy() == pytest.approx(expected(x), abs=1e-5)

@@ -601,7 +601,7 @@ def test_a_run_whose_end_fails_is_not_complete(tmp_path, tuples, monkeypatch):
     for error in (OSError("disk full"), KeyboardInterrupt()):
         directory = tmp_path / type(error).__name__
         with monkeypatch.context() as patch:
-            patch.setattr("erl_torch.run.single.certify", raising(error))
+            patch.setattr("erl_torch.run.single.with_bounds", raising(error))
             with pytest.raises(type(error)):
                 erl_torch.train(SHORT, MDP, tuples, directory=directory, evaluation=QUICK)
         result = directory / "result.json"

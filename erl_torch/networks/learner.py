@@ -25,7 +25,7 @@ from erl_torch.networks.layout import Layout, mlp
 from erl_torch.networks.live import Exploration, Live, Walk
 from erl_torch.networks.policy import ActorPolicy, NetworkPolicy
 from erl_torch.networks.problem import BoxProblem
-from erl_torch.networks.replay import COLUMNS, Replay, Steps
+from erl_torch.networks.replay import COLUMNS, Recorded, Replay, Steps
 from erl_torch.solution import Status
 
 LIMIT = 3.0  # the slope of the exponential loss is capped at exp(LIMIT)
@@ -373,15 +373,17 @@ class NetworkLearner:
         """The state of seed 0 of ``problem``, without an environment."""
         return self.init(problem, 0)
 
-    def begin(self, problem: BoxProblem, experience: Live | Steps, seed: int = 0) -> NetworkState:
-        """The state before anything is learnt from ``experience``; ``seed`` is that of recorded tuples."""
+    def begin(self, problem: BoxProblem, experience: Live | Recorded | Steps) -> NetworkState:
+        """The state before anything is learnt from ``experience``; of ``Steps`` alone the seed is 0."""
         if isinstance(experience, Live):
             return self.init(problem, experience.seed, None, experience.start())
-        scaled = replace(experience, reward=experience.reward * np.float32(self.reward_scale))
-        return self.init(problem, seed, Replay.of(scaled))
+        recorded = experience if isinstance(experience, Recorded) else Recorded(experience)
+        recorded.steps.check(problem)
+        scaled = replace(recorded.steps, reward=recorded.steps.reward * np.float32(self.reward_scale))
+        return self.init(problem, recorded.seed, Replay.of(scaled))
 
     def run(
-        self, problem: BoxProblem, experience: Live | Steps, state: NetworkState | None = None
+        self, problem: BoxProblem, experience: Live | Recorded | Steps, state: NetworkState | None = None
     ) -> Iterator[NetworkState]:
         """Yield the state after each epoch, from ``state`` on, until ``n_steps``."""
         state = self.begin(problem, experience) if state is None else state

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import os
+import zlib
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from erl_torch import checks
 from erl_torch.checks import InputError
+from erl_torch.files import read_npz, write_npz
+from erl_torch.networks.problem import BoxProblem
 
 COLUMNS = ("observation", "action", "reward", "following", "ended")
 
@@ -57,6 +62,56 @@ class Steps:
 
     def __len__(self) -> int:
         return len(self.reward)
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write an npz file of the five columns."""
+        return write_npz(path, {name: getattr(self, name) for name in COLUMNS})
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Steps:
+        """What ``save`` wrote, or an npz file with columns of these names. Raises InputError, of ``path``."""
+        found = read_npz(path)
+        lacking = [name for name in COLUMNS if name not in found]
+        if lacking:
+            raise InputError("path", path, f"an npz file with {', '.join(COLUMNS)}: it lacks {', '.join(lacking)}")
+        try:
+            return cls(*(found[name] for name in COLUMNS))
+        except InputError as error:
+            raise InputError(f"path={path}: {error.key}", error.value, error.allowed) from error
+
+    def checksum(self) -> int:
+        """Of all columns, in [0, 2**32)."""
+        running = 0
+        for name in COLUMNS:
+            running = zlib.crc32(np.ascontiguousarray(getattr(self, name)).tobytes(), running)
+        return running
+
+    def check(self, problem: BoxProblem) -> None:
+        """Raise InputError for tuples that are none of ``problem``."""
+        if self.observation.shape[1] != problem.n_observation:
+            allowed = f"of {problem.n_observation} numbers, as those of {problem.name}"
+            raise InputError("observation", f"{self.observation.shape[1]} numbers", allowed)
+        if problem.n_actions:
+            wrong = self.action.ndim > 1 or self.action.dtype.kind not in "iu"
+            allowed = f"whole numbers in [0, {problem.n_actions}), as {problem.name} has them"
+            if wrong or not ((self.action >= 0) & (self.action < problem.n_actions)).all():
+                raise InputError("action", "others", allowed)
+        elif self.action.shape[1:] != (len(problem.low),):
+            raise InputError(
+                "action", f"of shape {self.action.shape}", f"[N, {len(problem.low)}], as {problem.name} has"
+            )
+        elif not (
+            (self.action >= np.array(problem.low, np.float32)) & (self.action <= np.array(problem.high, np.float32))
+        ).all():
+            raise InputError("action", "others", f"inside the box of {problem.name}")
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """Tuples to learn from, with the seed of networks and minibatches."""
+
+    steps: Steps
+    seed: int = 0
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,6 +12,7 @@ import numpy as np
 from erl_torch.networks.learner import NetworkLearner, NetworkSolution, NetworkState, solution_of
 from erl_torch.networks.live import Live
 from erl_torch.networks.problem import BoxProblem
+from erl_torch.networks.replay import Recorded
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,16 +50,17 @@ class Seeds:
         return SeedsState(tuple(self.learner.init(problem, seed) for seed in self.seeds))
 
     def run(
-        self, problem: BoxProblem, experience: Sequence[Live], state: SeedsState | None = None
+        self, problem: BoxProblem, experience: Sequence[Live | Recorded], state: SeedsState | None = None
     ) -> Iterator[SeedsState]:
         """Yield the states after each epoch, from ``state`` on."""
         if state is None:
-            state = SeedsState(tuple(self.learner.begin(problem, live) for live in experience))
+            state = SeedsState(tuple(self.learner.begin(problem, one) for one in experience))
+        lives = [one if isinstance(one, Live) else None for one in experience]
         with ThreadPoolExecutor(self.threads) as pool:
             while self.position(state) < self.learner.n_steps:
                 tasks = [
                     pool.submit(self.learner.epoch, problem, one, live)
-                    for one, live in zip(state.each, experience, strict=True)
+                    for one, live in zip(state.each, lives, strict=True)
                 ]
                 state = SeedsState(tuple(task.result() for task in tasks))
                 yield state

@@ -25,6 +25,7 @@ from erl_torch.networks.live import Live
 from erl_torch.networks.policy import Acting, NetworkPolicy, Prior
 from erl_torch.networks.problem import BoxProblem, Truth, spaces
 from erl_torch.networks.quantities import NETWORK_QUANTITIES
+from erl_torch.networks.replay import Recorded, Steps
 from erl_torch.networks.seeds import Seeds, SeedsState
 from erl_torch.networks.truth import TRUTHS
 from erl_torch.notes import note
@@ -85,6 +86,7 @@ class NetworkRecorder:
         settings: what is measured.
         title: names, for result and summary.
         many: whether it is a run of replicas.
+        live: whether it steps the environment while it learns.
     """
 
     learner: NetworkLearner
@@ -94,6 +96,7 @@ class NetworkRecorder:
     settings: EvaluationSettings
     title: Title
     many: bool
+    live: bool = True
     first: dict[str, np.ndarray] = field(default_factory=dict)
     last: dict[str, np.ndarray] = field(default_factory=dict)
 
@@ -140,7 +143,7 @@ class NetworkRecorder:
         return tagged("prior", self._one(self.first)) | tagged("optimal", self._optimum())
 
     def _metrics(self) -> list[str]:
-        return list(self.learner.names(True))
+        return list(self.learner.names(self.live))
 
     def boards(self, alone: bool) -> Boards:
         if self.many:
@@ -318,10 +321,6 @@ def network_parts(
     """Learner, problem, experience, recorder and hyperparameters of the run ``cfg``. Raises InputError."""
     if cfg.vary:
         raise InputError("vary", dict(cfg.vary), "{}, for learners with networks: sweep with -m learner.KEY=A,B")
-    if cfg.experience.name != "simulate":
-        raise InputError(
-            "experience", cfg.experience.name, "simulate: learners with networks step the environment themselves"
-        )
     problem = make_network_problem(cfg)
     learner: NetworkLearner = made(cfg.learner, resolve(cfg.learner["class"], "learner.class"), "learner")
     learner = suited(learner, problem)
@@ -331,9 +330,32 @@ def network_parts(
     if kind is not None and settings.certify:
         truth = kind(float(learner.beta), float(learner.optimism))
     seeds = tuple(cfg.seed + i for i in range(cfg.n_replicas))
-    lives = [Live(problem, seed) for seed in seeds]
+    experience: list[Live | Recorded] = [Live(problem, seed) for seed in seeds]
+    recorded = _recorded(cfg.experience, problem)
+    if recorded is not None:
+        experience = [Recorded(recorded, seed) for seed in seeds]
     title = Title(cfg.env.name, cfg.learner.name, cfg.seed)
-    recorder = NetworkRecorder(learner, problem, truth, seeds, settings, title, many)
+    recorder = NetworkRecorder(learner, problem, truth, seeds, settings, title, many, recorded is None)
+    told = {} if recorded is None else {"n_experience": len(recorded)}
     if many:
-        return Seeds(learner, seeds, cfg.threads or os.cpu_count() or 1), problem, lives, recorder, {}
-    return learner, problem, lives[0], recorder, {}
+        return Seeds(learner, seeds, cfg.threads or os.cpu_count() or 1), problem, experience, recorder, told
+    return learner, problem, experience[0], recorder, told
+
+
+def _recorded(cfg: DictConfig, problem: BoxProblem) -> Steps | None:
+    """The tuples of group ``experience``; None where the environment is stepped. Raises InputError."""
+    if cfg.name == "simulate":
+        return None
+    if cfg.name != "recorded":
+        allowed = "simulate (learners with networks step the environment themselves) or recorded"
+        raise InputError("experience", cfg.name, allowed)
+    with group("experience"):
+        steps = Steps.load(str(cfg.path))
+        steps.check(problem)
+        return steps
+
+
+def network_digest(experience: Any) -> int | None:  # of one learner, or of each of several
+    """A checksum of recorded tuples; None where environments are stepped."""
+    one = experience[0] if isinstance(experience, list) else experience
+    return one.steps.checksum() if isinstance(one, Recorded) else None

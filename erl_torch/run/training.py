@@ -57,7 +57,7 @@ from erl_torch.run.checkpoint import Checkpoints, failure_of
 from erl_torch.run.groups import Group, groups_of
 from erl_torch.run.judge import EvaluationSettings
 from erl_torch.run.loop import Run, SafePoint
-from erl_torch.run.networks import has_networks, network_parts
+from erl_torch.run.networks import has_networks, network_digest, network_parts
 from erl_torch.run.origin import shown
 from erl_torch.run.replicas import ReplicaRecorder
 from erl_torch.run.report import Title
@@ -115,7 +115,7 @@ def train(cfg: DictConfig, directory: Path, safe_point: Callable[[], None] = lam
             learner=learner,
             problem=problem,
             experience=experience,
-            digest=None if networks else digest(experience),
+            digest=network_digest(experience) if networks else digest(experience),
             recorder=recorder,
             saved=saved,
             hyperparameters=hyperparameters(plain(cfg), shown(directory), **more),
