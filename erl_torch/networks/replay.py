@@ -100,10 +100,12 @@ class Steps:
             raise InputError(
                 "action", f"of shape {self.action.shape}", f"[N, {len(problem.low)}], as {problem.name} has"
             )
-        elif not (
-            (self.action >= np.array(problem.low, np.float32)) & (self.action <= np.array(problem.high, np.float32))
-        ).all():
+        elif not self._inside(problem):
             raise InputError("action", "others", f"inside the box of {problem.name}")
+
+    def _inside(self, problem: BoxProblem) -> bool:
+        low, high = np.array(problem.low, np.float32), np.array(problem.high, np.float32)
+        return bool(((self.action >= low) & (self.action <= high)).all())
 
 
 @dataclass(frozen=True, eq=False)
