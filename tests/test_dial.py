@@ -579,3 +579,48 @@ def test_bounds_of_another_problem_certify_nothing(best):
     with pytest.raises(InputError, match=r"best=of beta .* must be of beta 3, optimism -2"):
         certify(solution, mdp, 3.0, best=solve_soft_bellman(mdp, best["beta"], optimism=best["optimism"]))
     assert certify(solution, mdp, 3.0, best=solution).gap <= 1e-9
+
+
+def rates(p, r, prior, beta, optimism, policy, rounds=6000):
+    """(g*, J of ``policy``) at ``optimism``, by value iteration from their equations; dense rows."""
+    kappa = optimism * beta
+
+    def certain(v):
+        return (
+            (p @ v)
+            if kappa == 0
+            else np.log(np.einsum("sat,t->sa", p, np.exp(kappa * (v - v.max())))) / kappa + v.max()
+        )
+
+    with np.errstate(divide="ignore", invalid="ignore"):
+        cost = np.where(policy > 0, policy * np.log(policy / prior), 0.0).sum(1) / beta
+    found = []
+    for backup in (
+        lambda q: np.log((prior * np.exp(beta * (q - q.max()))).sum(1)) / beta + q.max(),
+        lambda q: (policy * q).sum(1) - cost,
+    ):
+        v = np.zeros(len(r))
+        for _ in range(rounds):
+            new = backup(r + certain(v))
+            gain, v = new - v, 0.5 * (v + new - new[0])
+        assert np.ptp(gain) < 1e-9
+        found.append(float(gain.mean()))
+    return found
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("optimism", [-0.3, -1.0, -3.0])
+@pytest.mark.parametrize("max_steps", [1, 2, 3])
+def test_the_gap_of_a_search_that_was_stopped_is_a_loss(seed, optimism, max_steps):
+    """Below 0 the policy at hand is worth J under nature's answer: its gap is at least g* - J, and no number of
+    another problem's."""
+    rng = np.random.default_rng(seed)
+    mdp, beta = random_mdp(rng, 4, 3), 2.0
+    prior = random_policy(rng, 4, 3)
+    found = solve_soft_bellman(mdp, beta, prior, max_steps=max_steps, optimism=optimism)
+    p = mdp.transition.toarray().reshape(4, 3, 4)
+    best, worth = rates(p, mdp.reward, prior, beta, optimism, found.policy.numpy())
+    assert found.gap >= best - worth - 1e-9
+    assert found.theta_bounds[0] - 1e-9 <= -best <= found.theta_bounds[1] + 1e-9
+    own = certify(found, mdp, beta, prior, optimism=optimism).gap
+    assert own == pytest.approx(best - worth, abs=1e-7)

@@ -93,3 +93,13 @@ def test_replicas_whose_optimism_varies_draw_it(tmp_path):
     # What is optimised over settings is what a policy is worth in the real world.
     worth = [group["objective_real"]["mean"] for group in result["groups"]]
     assert result["objective"] == max(worth)
+
+
+def test_the_tangent_is_of_the_prior_that_is_given():
+    """d theta/d optimism at 0, by differences, under a prior that is not uniform."""
+    rng = np.random.default_rng(0)
+    mdp, prior = random_mdp(rng, 4, 3), rng.dirichlet(np.ones(3), 4)
+    line = exact_line(mdp, 2.0, prior, [-0.5, 0.5], None)
+    h = 1e-4
+    around = [solve_soft_bellman(mdp, 2.0, prior, optimism=o).theta for o in (-h, 0.0, h)]
+    assert line.tangent == pytest.approx((around[1], (around[2] - around[0]) / (2 * h)), abs=1e-6)

@@ -7,6 +7,7 @@ import pytest
 from helpers import composed, random_mdp
 
 from erl_torch import InputError, collect, empirical_mdp, theta_uncertainty
+from erl_torch.empirical import informative
 from erl_torch.empirical.informative import collect_informative, informative_policy
 from erl_torch.envs.windy_cliff import WindyCliffEnv
 from erl_torch.evaluation import Judge
@@ -101,3 +102,26 @@ def test_one_stream_is_not_designed_for_several_problems(tmp_path):
     for key in ("beta", "optimism"):
         with pytest.raises(InputError, match=rf"vary.{key}=.*one value, for which the stream is designed"):
             train(composed(*few, f"+vary.{key}=[0.5,1]"), tmp_path / key)
+
+
+@pytest.mark.parametrize("rounds", [1, 2, 7])
+def test_every_round_but_the_first_is_designed_for_the_problem_that_is_asked(monkeypatch, rounds):
+    """... of its own beta and optimism, from the tuples so far."""
+    asked = []
+    real = informative_policy
+
+    def noted(model, beta, n_more, *arguments, **more):
+        asked.append((int(model.visits.sum()), beta, more["optimism"]))
+        return real(model, beta, n_more, *arguments, **more)
+
+    monkeypatch.setattr(informative, "informative_policy", noted)
+    data = collect_informative(WindyCliffEnv().mdp, 14, 50, 3.0, optimism=-0.5, rounds=rounds)
+    assert [one[1:] for one in asked] == [(3.0, -0.5)] * (rounds - 1)
+    assert [one[0] for one in asked] == [len(data) * k // rounds for k in range(1, rounds)]
+
+
+def test_the_design_is_of_its_own_optimism():
+    """What narrows theta's interval at optimism 1 is another policy than what narrows it at 0."""
+    model = empirical_mdp(collect(WindyCliffEnv().mdp, 20, 1000, 0), 15, 4)
+    at = {o: informative_policy(model, 10.0, 10_000, optimism=o) for o in (0.0, 1.0)}
+    assert np.abs(at[0.0] - at[1.0]).max() > 0.05

@@ -742,3 +742,67 @@ def test_features_that_tell_nothing_identify_nothing(kind, optimism):
     assert found.unidentified.shape == (features.shape[2], features.shape[2])
     assert found.standard_error is None or np.isinf(found.standard_error).all()
     assert found.gap == 0 or not np.signbit(found.gap)
+
+
+@pytest.mark.parametrize("scale", [(1.0, 1.0, 1.0, 1.0), (1.0, 100.0, 0.01, 5.0)])
+def test_directions_that_are_not_told_are_kept_at_zero(scale):
+    """A shaping feature and a repeated one, of sizes that differ: the weights have no part in what is not told."""
+    mdp, features, w, policy = linear_problem(3)
+    shaping = (np.arange(6.0)[:, None] - mdp.transition.toarray().reshape(6, 3, 6) @ np.arange(6.0))[:, :, None]
+    table = np.concatenate([features[:, :, :2], shaping, features[:, :, :1]], axis=2) * np.array(scale)
+    fit = fit_reward(1e4 * policy(w), table, mdp=mdp, beta=2.0)
+    assert fit.unidentified.shape == (4, 2)
+    assert np.abs(fit.unidentified.T @ fit.weights).max() < 1e-9 * np.abs(fit.weights).max()
+
+
+def log_likelihood(mdp, features, beta, optimism, s, a, weight):
+    """Mean of log pi_w(a|s) as a function of w."""
+
+    def of(w):
+        model = TabularMDP(mdp.transition, features @ w, mdp.start)
+        policy = solve_soft_bellman(model, beta, optimism=optimism).policy.numpy()
+        return float((weight * np.log(policy[s, a])).sum() / weight.sum())
+
+    return of
+
+
+def gradient(function, w, h=1e-5):
+    return np.array([(function(w + h * e) - function(w - h * e)) / (2 * h) for e in np.eye(len(w))])
+
+
+@pytest.mark.parametrize("penalty", [0.02, 0.3])
+def test_penalty_is_of_the_log_likelihood_of_a_step(penalty):
+    """At the maximum of L(w) - penalty |w|^2/2 its slope is 0, L by the exact solver, whatever the size of features."""
+    mdp, features, w, policy = linear_problem(4)
+    features = features * np.array([1.0, 3.0, 0.5])
+    expert = policy(w)
+    fit = fit_reward(expert, features, mdp=mdp, beta=2.0, exact=True, penalty=penalty)
+    p = np.einsum("sa,sat->st", expert, mdp.transition.toarray().reshape(6, 3, 6))
+    share = np.linalg.lstsq(np.vstack([p.T - np.eye(6), np.ones(6)]), np.r_[np.zeros(6), 1.0], rcond=None)[0]
+    s, a = np.divmod(np.arange(18), 3)
+    of = log_likelihood(mdp, features, 2.0, 0.0, s, a, (share[:, None] * expert).ravel())
+    assert gradient(of, fit.weights) == pytest.approx(penalty * fit.weights, abs=1e-6)
+
+
+def test_above_0_the_likelihood_of_the_steps_is_maximal():
+    """Of walks that restart: every step counts once, and none is weighed by a flow."""
+    mdp, features, w, _ = linear_problem(5)
+    optimism, beta = 0.5, 2.0
+    expert = solve_soft_bellman(
+        TabularMDP(mdp.transition, features @ w, mdp.start), beta, optimism=optimism
+    ).policy.numpy()
+    rng = np.random.default_rng(0)
+    p = mdp.transition.toarray().reshape(6, 3, 6)
+    rows = []
+    for _ in range(60):
+        s = 0
+        for _ in range(6):
+            a = int(rng.choice(3, p=expert[s]))
+            after = int(rng.choice(6, p=p[s, a]))
+            rows.append((s, a, after))
+            s = after
+    s, a, after = map(np.array, zip(*rows, strict=True))
+    data = Transitions(s, a, np.zeros(len(s)), after, a)
+    fit = fit_reward(data, features, mdp=mdp, beta=beta, optimism=optimism, pseudo_count=1e-9)
+    of = log_likelihood(mdp, features, beta, optimism, s, a, np.ones(len(s)))
+    assert gradient(of, fit.weights) == pytest.approx(np.zeros(3), abs=1e-6)
